@@ -14,6 +14,7 @@ from typing import Annotated
 
 import typer
 
+from benchmarks.console import parse_counts
 from benchmarks.gpu.lab import Plan
 from benchmarks.gpu.runner import Runner
 from benchmarks.gpu.steps import STEPS
@@ -23,6 +24,7 @@ def main(
     out: Annotated[Path, typer.Option(envvar="OUT", help="The folder of the report.")] = Path("build/gpu"),
     steps: Annotated[str, typer.Option(help=f"Some of {', '.join(STEPS)}; default: all.")] = "",
     seconds: Annotated[float, typer.Option(min=1, help="For all steps together.")] = 570.0,
+    rows: Annotated[str, typer.Option(help="The batch sizes of the steps graphs and compiled.")] = "1,4,16",
     dry: Annotated[bool, typer.Option("--dry", help="Small sizes, on a CPU.")] = False,
 ) -> None:
     """Measure and check everything that needs a GPU."""
@@ -35,7 +37,8 @@ def main(
     with tempfile.TemporaryDirectory(dir=memory if memory.is_dir() else None) as scratch:
         os.environ["TORCHINDUCTOR_CACHE_DIR"] = f"{scratch}/programs"  # so that the first start compiles all
         os.environ.setdefault("PYTORCH_NVML_BASED_CUDA_CHECK", "1")  # imports must not initialise CUDA before a fork
-        met = Runner(Plan(out.absolute(), Path(scratch), dry, seconds), {name: STEPS[name] for name in names}).run()
+        plan = Plan(out.absolute(), Path(scratch), dry, seconds, tuple(parse_counts(rows, "--rows")))
+        met = Runner(plan, {name: STEPS[name] for name in names}).run()
     raise typer.Exit(0 if met else 1)
 
 

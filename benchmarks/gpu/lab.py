@@ -5,8 +5,11 @@ from __future__ import annotations
 import contextlib
 import json
 import queue
+import sys
 import threading
 import time
+import traceback
+from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -31,6 +34,7 @@ from vlagents_ray.testing.agents import random_observation
 CAMERAS = {"base_0_rgb": "front", "left_wrist_0_rgb": "wrist", "right_wrist_0_rgb": "right_wrist"}
 INSTRUCTION = "pick up the cube"
 LATE_S = 120.0
+_LOOK_S, _LINES = 0.1, 25  # of `lines_of`: between two looks, and lines that are shown
 
 
 @dataclass(frozen=True, slots=True)
@@ -41,6 +45,7 @@ class Plan:
     scratch: Path  # for checkpoints, compiled programs, and what steps leave for later ones
     dry: bool = False
     seconds: float = 570.0  # for all steps together
+    rows: tuple[int, ...] = (1, 4, 16)  # batch sizes that are compiled
 
     def checkpoint(self, family: str) -> dict[str, Any]:
         """Return the settings of a policy with the family's random checkpoint, which the step "checkpoint" wrote."""
@@ -54,11 +59,39 @@ class Lab:
     def __init__(self, plan: Plan, step: str) -> None:
         self.plan, self.dry, self._file = plan, plan.dry, plan.scratch / f"step-{step}.json"
         self.found: dict[str, Any] = {"figures": {}, "checks": []}
+        self._lock = threading.Lock()
 
     def show(self, **figures: Any) -> None:
         """Write figures: numbers, texts, lists of texts, or lists of rows, which become a table."""
-        self.found["figures"] |= figures
-        self._file.write_text(json.dumps(self.found, default=float))
+        with self._lock:
+            self.found["figures"] |= figures
+            self._file.write_text(json.dumps(self.found, default=float))
+
+    @contextlib.contextmanager
+    def lines_of(self, thread: str | tuple[str, ...], title: str) -> Iterator[None]:
+        """Show, also while this context runs, the lines of the package in which threads spend it, by their names."""
+        seen, over = Counter[str](), threading.Event()
+
+        def look() -> None:
+            begun = time.perf_counter()
+            while not over.wait(_LOOK_S):
+                now, frames = time.perf_counter(), sys._current_frames()
+                idents = [one.ident or 0 for one in threading.enumerate() if one.name.startswith(thread)]
+                stack = [frame for ident in idents for frame, _ in traceback.walk_stack(frames.get(ident))]
+                lines = {(Path(one.f_code.co_filename), one.f_lineno) for one in stack}
+                for path, line in lines:
+                    if "vlagents_ray" in path.parts:
+                        seen[f"{path.name}:{line}"] += round((now - begun) * 1e3)
+                self.show(**{title: [f"{ms / 1e3:.1f} s at {line}" for line, ms in seen.most_common(_LINES)]})
+                begun = now
+
+        watch = threading.Thread(target=look, daemon=True)
+        watch.start()
+        try:
+            yield
+        finally:
+            over.set()
+            watch.join()
 
     def check(self, name: str, got: Any, *, least: float | None = None, most: float | None = None,
               equal: Any = None, speed: bool = False) -> None:  # fmt: skip
@@ -103,7 +136,8 @@ class Lab:
         offered = Checkpoints(partial(build_agent, "pi0"), config, {"other": {"seed": 1}}, loaded=2)
         engine = Engine(offered, max_batch_size=rows, patience=0.1)
         try:
-            engine.start()
+            with self.lines_of("policy", "start"):
+                engine.start()
             yield engine
         finally:
             engine.close()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import faulthandler
 import json
 import math
 import multiprocessing
@@ -26,15 +27,19 @@ from vlagents_ray.policies.compilation import Compilation
 from vlagents_ray.registry import require
 
 _SPARE_S = 15.0  # without which no step is started
+_STACKS_S = (
+    1.0  # before the limit of a step, when the log gets the stacks of all its threads, at which Python may crash
+)
 
 
-def _child(plan: Plan, name: str, run: Callable[[Lab], None]) -> None:
+def _child(plan: Plan, name: str, run: Callable[[Lab], None], limit_s: float) -> None:
     """Run a step, as a process in a group of its own."""
     die_with_parent()
     os.setsid()
     log = os.open(plan.out / "gpu.log", os.O_WRONLY | os.O_APPEND | os.O_CREAT)
     os.dup2(log, 1), os.dup2(log, 2)
     typer.echo(f"\n== {name}")
+    faulthandler.dump_traceback_later(max(0.1, limit_s - _STACKS_S), file=log)
     lab = Lab(plan, name)
     try:
         if plan.dry:
@@ -85,7 +90,9 @@ class Runner:
         return self._plan.seconds - (time.monotonic() - self._begun)
 
     def _start(self, name: str) -> BaseProcess:
-        process: BaseProcess = self._context.Process(target=_child, args=(self._plan, name, self._steps[name].run))
+        step = self._steps[name]
+        args = (self._plan, name, step.run, min(step.limit_s, self._left()))
+        process: BaseProcess = self._context.Process(target=_child, args=args)
         process.start()
         return process
 

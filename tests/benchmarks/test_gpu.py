@@ -55,7 +55,10 @@ def found(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
     runner = Runner(plan, {name: Step(run, 3 if run is hangs else 60) for name, run in steps.items()})
     assert runner.run() is False
     assert (plan.out / "gpu.md").read_text().count("**no**") == 4
-    assert "illegal memory access" in (plan.out / "gpu.log").read_text()
+    log = (plan.out / "gpu.log").read_text()
+    assert "illegal memory access" in log
+    assert "Timeout (" in log  # where the step that hangs was
+    assert "in hangs" in log
     document: dict[str, Any] = json.loads((plan.out / "gpu.json").read_text())
     return document
 
@@ -121,6 +124,14 @@ def test_the_network_is_timed_alone_and_once(monkeypatch: pytest.MonkeyPatch) ->
     assert timer.measure(lambda: None) is None
     inner(rows[0])  # not measured: takes no time from the clock
     assert Compilation(False).core("plain", inner) is inner
+
+
+def test_a_timed_core_is_part_of_another_as_without_a_timer() -> None:
+    compilation = Compilation("graphs")
+    with NetworkTimer().loading():
+        part = compilation.core("part", lambda x: x)
+        compilation.core("whole", part, parts=[part])
+    assert compilation.cores[1]._parts == compilation.cores[:1]
 
 
 def test_gaps_are_between_kernels_that_may_overlap() -> None:

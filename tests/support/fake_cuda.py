@@ -64,6 +64,7 @@ class FakeCuda:
             "Stream": lambda device=None: Stream(self, self._index(device)),
             "stream": self._on_stream,
             "device": self._on_device,
+            "current_device": lambda: self._index(None),
             "current_stream": self.current_stream,
             "synchronize": self.synchronize,
             "empty_cache": self._empty_cache,

@@ -223,14 +223,14 @@ class AppTarget(WeightsTarget):
         self._app = app
 
     def push(self, named: Mapping[str, Any], options: PushOptions) -> int:
-        import ray
-
         if gpu_of(named):
             try:
                 with shared(named) as values:
                     return self._push(values, options)
             except NotShared as error:
                 logger.info("serve://%s: the weights go through Ray's object store: %s", self._app, error)
+        import ray
+
         return self._push([ray.put(_portable(named))], options)
 
     def _push(self, values: Values, options: PushOptions) -> int:

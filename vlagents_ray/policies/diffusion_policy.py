@@ -16,7 +16,7 @@ from vlagents_ray.contract import ActionSpec, Contract, StateSpec
 from vlagents_ray.errors import ConfigError
 from vlagents_ray.interface import Obs
 from vlagents_ray.policies.base import ModelConfig, ModelPolicy, Prediction, Row
-from vlagents_ray.policies.base.accelerator import ensure_torchvision, torch_device
+from vlagents_ray.policies.base.accelerator import ensure_torchvision, fetch, torch_device
 from vlagents_ray.policies.base.checkpoint import find_checkpoint, require_loaded
 from vlagents_ray.policies.base.checkpoint_files import revision
 from vlagents_ray.policies.base.model_code import use_source
@@ -135,7 +135,7 @@ class DiffusionPolicy(ModelPolicy):
         own = network.module, require("diffusers.utils.torch_utils")  # the scheduler's steps draw in the latter
         with torch.inference_mode(), RowNoise(rows, network.draws, *own):
             actions = network.module.predict_action(inputs)["action"]
-        return [Prediction(chunk) for chunk in actions.float().cpu().numpy()]
+        return [Prediction(chunk) for chunk in fetch(actions.float())]
 
     def _parts(self, network: DiffusionNetwork) -> list[str]:
         usual = ["state" if name == OBS else name for name in network.vectors]

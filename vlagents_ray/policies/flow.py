@@ -22,6 +22,7 @@ from typing import Any
 import numpy as np
 
 from vlagents_ray.policies.adapters import Adapters
+from vlagents_ray.policies.base.accelerator import fetch
 from vlagents_ray.policies.base.model_inputs import Row
 from vlagents_ray.policies.compilation import Compilation
 from vlagents_ray.registry import require
@@ -164,7 +165,7 @@ class RandomSteps:
         """Return the outputs requested of rows, by their places, after the last step; None: all rows, all numbers."""
         stds = [step_std(step, self._steps, self._level) for step in range(self._steps)]
         total = sum(map(normal_logprob, self._chain[1:], self._means, stds))
-        *chains, logprobs = require("torch").stack([*self._chain, total]).cpu().numpy()  # one copy, for which it waits
+        *chains, logprobs = fetch(require("torch").stack([*self._chain, total]))  # one copy, for which it waits
         logprob = logprobs[:, :execute, :dim]
         entropy = chain_entropy(self._steps, self._level) * logprob[0].size
         found: dict[int, dict[str, Any]] = {}

@@ -21,7 +21,7 @@ from vlagents_ray.contract import ActionSpec, Contract, StateSpec
 from vlagents_ray.errors import ConfigError
 from vlagents_ray.interface import Obs
 from vlagents_ray.policies.base import ModelConfig, ModelPolicy, Prediction, Row
-from vlagents_ray.policies.base.accelerator import ensure_torchvision, torch_device, torch_dtype
+from vlagents_ray.policies.base.accelerator import ensure_torchvision, fetch, torch_device, torch_dtype
 from vlagents_ray.policies.base.checkpoint import SavedTensors, find_checkpoint, require_loaded
 from vlagents_ray.policies.base.model_code import remote_code, use_source
 from vlagents_ray.policies.base.model_inputs import (
@@ -300,7 +300,7 @@ class Gr00tNetwork:
         from vlagents_ray.policies.sampling_rng import RowDraws
 
         with require("torch").inference_mode(), RowDraws(rngs, self.model.action_head):
-            drawn = self.model.get_action(**collated)["action_pred"].float().cpu().numpy()
+            drawn = fetch(self.model.get_action(**collated)["action_pred"].float())
         raw = {group: np.stack([one["raw"][group] for one in inputs]) for group in self.embodiment.state}
         decoded = self.processor.decode_action(drawn, self.embodiment, raw)
         return list(np.concatenate([decoded[group] for group in self.embodiment.action], axis=-1).astype(np.float32))

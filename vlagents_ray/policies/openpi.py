@@ -18,7 +18,7 @@ from vlagents_ray.contract import ActionSpec, Contract, StateSpec
 from vlagents_ray.errors import ConfigError, InvalidObservation
 from vlagents_ray.interface import Obs
 from vlagents_ray.policies.base import ModelConfig, ModelPolicy, Prediction, Row
-from vlagents_ray.policies.base.accelerator import jax_device, torch_device
+from vlagents_ray.policies.base.accelerator import fetch, jax_device, torch_device
 from vlagents_ray.policies.base.checkpoint import STEP, SavedTensors, find_checkpoint, require_loaded
 from vlagents_ray.policies.base.config import NoiseLevel
 from vlagents_ray.policies.base.model_code import use_source
@@ -385,7 +385,7 @@ class TorchFlow(OpenPiModel):
         with torch.inference_mode():
             inputs = self._network._preprocess_observation(observation, train=False)
             flow = self._passes.sample(*inputs, noise=start, owners=batch.owners, steps=self._steps, changes=changes)
-        return np.asarray(flow.float().cpu().numpy())
+        return fetch(flow.float())
 
     def random_steps(self, rows: Sequence[Row], noise_level: float) -> RandomSteps | None:
         return RandomSteps.of(rows, (self._steps, *self.noise_shape), noise_level, self._convert)

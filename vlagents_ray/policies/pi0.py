@@ -19,7 +19,7 @@ from vlagents_ray.contract import ActionSpec, Contract
 from vlagents_ray.errors import ConfigError, InvalidObservation
 from vlagents_ray.interface import Obs
 from vlagents_ray.policies.base import ModelConfig, ModelPolicy, Prediction, Row, shared_frames
-from vlagents_ray.policies.base.accelerator import ensure_torchvision, torch_device, torch_dtype
+from vlagents_ray.policies.base.accelerator import ensure_torchvision, fetch, torch_device, torch_dtype
 from vlagents_ray.policies.base.checkpoint import find_checkpoint, from_pretrained
 from vlagents_ray.policies.base.config import NoiseLevel
 from vlagents_ray.policies.base.model_inputs import (
@@ -222,7 +222,7 @@ class Pi0(ModelPolicy):
                 fingerprints=[row.adapter for row in rows],
             )
             stated = {} if random is None else random.stated(self.config.execute, len(model.processor.actions_mean))
-        return [Prediction(model.actions(one), behaviour=stated.get(i, {})) for i, one in enumerate(flow.cpu().numpy())]
+        return [Prediction(model.actions(one), behaviour=stated.get(i, {})) for i, one in enumerate(fetch(flow))]
 
     @property
     def _steps(self) -> int:

@@ -17,7 +17,7 @@ from vlagents_ray.contract import ActionSpec, Contract
 from vlagents_ray.errors import ConfigError, InvalidObservation, MissingDependency
 from vlagents_ray.interface import GOAL_IMAGE, Obs
 from vlagents_ray.policies.base import ModelPolicy, Prediction, Row
-from vlagents_ray.policies.base.accelerator import ensure_torchvision, torch_device, torch_dtype
+from vlagents_ray.policies.base.accelerator import ensure_torchvision, fetch, torch_device, torch_dtype
 from vlagents_ray.policies.base.checkpoint import find_checkpoint, from_pretrained, require_loaded
 from vlagents_ray.policies.base.config import ModelConfig
 from vlagents_ray.policies.base.model_code import use_source
@@ -488,7 +488,7 @@ class VJepa2Ac(ModelPolicy):
             )
             goals = torch.stack([row.memory[_GOAL_FEATURES] for row in rows])
             plans = plan(world, features, poses, goals, noise, config)
-        actions, std, energy = (part.cpu().numpy() for part in (plans.actions, plans.std, plans.energy))
+        actions, std, energy = (fetch(part) for part in (plans.actions, plans.std, plans.energy))
         predictions = []
         for i, row in enumerate(rows):
             steps = _openings(actions[i], row.frames[-1].pose[6])

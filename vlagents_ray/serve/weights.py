@@ -15,8 +15,8 @@ import logging
 import threading
 from abc import ABC, abstractmethod
 from collections import deque
-from collections.abc import Callable, Iterable, Mapping, Sequence
-from contextlib import nullcontext
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass
 from typing import Any, Literal, Protocol, get_args
 from weakref import WeakValueDictionary, ref
@@ -36,6 +36,7 @@ from vlagents_ray.interface import POLICY, Agent
 from vlagents_ray.policies.base.accelerator import empty_cache, free_memory, is_out_of_memory
 from vlagents_ray.policies.compilation import CAPTURES
 from vlagents_ray.policies.wrapper import Wrapper
+from vlagents_ray.weights.pinned_copies import beside_acts
 from vlagents_ray.weights.safetensors import ValueSpec, read_header
 from vlagents_ray.weights.shared_values import SharedValues, gpu_of, opened, readable_gpus
 from vlagents_ray.weights.trainable import (
@@ -141,6 +142,7 @@ class ModelWeights:
         self.model = model
         self.gpus: tuple[str, ...] = ()  # see `NewestVersion`
         self._agent, self._busy = agent, busy
+        self._device: Any = "cpu"  # the GPU of its values, if they are on one
         self._lock = threading.Lock()
         try:
             values: dict[str, Any] | None = agent.parameters()
@@ -157,6 +159,8 @@ class ModelWeights:
             self._in_place, self._swaps = own or copied, copied and not own and are_apart(values or {})
             first = WeightsVersion(0, fingerprint(values or {}), None if self._in_place else values)
             self.gpus = readable_gpus(gpu_of(values or {}))
+            on_gpu = (value.device for value in (values or {}).values() if getattr(value, "is_cuda", False))
+            self._device = next(on_gpu, "cpu")
         self.newest = self.pinned = first
         self._staged: WeightsVersion | None = None
         self._timer: threading.Timer | None = None
@@ -192,14 +196,15 @@ class ModelWeights:
         outgoing, self._live = None if self._live is None else ref(self._live), None
         live = None if outgoing is None else outgoing()  # None if nothing else refers to it
         kept = live if self._in_place and live is not None and live.values is None else None
-        if kept is not None and version.values is not None and self._swaps and not version.on_host:
-            swap(self._agent.parameters(), version.values)
-            kept.values = version.values
-        else:
-            if kept is not None:
-                kept.values = mapped(own_copy, self._agent.parameters())
-            if version.values is not None:  # otherwise the agent still has its own values
-                self._agent.load_parameters(version.values)
+        with beside_acts(self._device):  # all use of versions' memory is on that stream
+            if kept is not None and version.values is not None and self._swaps and not version.on_host:
+                swap(self._agent.parameters(), version.values)
+                kept.values = version.values
+            else:
+                if kept is not None:
+                    kept.values = mapped(own_copy, self._agent.parameters())
+                if version.values is not None:  # otherwise the agent still has its own values
+                    self._agent.load_parameters(version.values)
         self._live = version
         self._switches += 1
         if self._in_place:
@@ -270,8 +275,7 @@ class ModelWeights:
                 raise Overloaded("weights: another push is under way; push again when it is over")
             self._staged = placeholder
         try:
-            with CAPTURES.pushes:
-                self._require_awake()
+            with self._uncaptured():
                 if self._swaps:
                     self._move_to_host({session.weights for session in sessions()})
                 staged = self.make(number, newest, pushed, options)
@@ -291,8 +295,7 @@ class ModelWeights:
         self, number: int, newest: WeightsVersion, pushed: Mapping[str, Any] | SharedValues, options: PushOptions
     ) -> WeightsVersion:
         """Return a version of pushed values, which have been checked; missing names have the values of the newest."""
-        with CAPTURES.pushes, opened(pushed) if isinstance(pushed, SharedValues) else nullcontext(pushed) as named:
-            self._require_awake()
+        with self._uncaptured(), opened(pushed) if isinstance(pushed, SharedValues) else nullcontext(pushed) as named:
             new = accepted(self._held(newest), named, partial=options.partial)
             with self._busy if self._in_place else nullcontext():  # another version could become the agent's
                 held = self._agent.parameters() if newest.values is None else newest.values
@@ -353,8 +356,7 @@ class ModelWeights:
 
     def portable_values(self, version: WeightsVersion) -> dict[str, Any]:
         """Return the values of a version as numpy arrays, for another process."""
-        with CAPTURES.pushes:
-            self._require_awake()
+        with self._uncaptured():
             return {name: portable(value) for name, value in self._values(version).items()}
 
     def sleep(self, *, offload: bool) -> None:
@@ -396,9 +398,14 @@ class ModelWeights:
                 ) from error
             self._asleep = False
 
-    def _require_awake(self) -> None:
-        if self._asleep:
-            raise PolicyUnavailable("weights: the policy sleeps; give wake() the new values, or call it first")
+    @contextmanager
+    def _uncaptured(self) -> Iterator[None]:
+        """Work on versions beside the acts, but not beside a capture; raises `PolicyUnavailable` while they sleep."""
+        with CAPTURES.pushes:
+            if self._asleep:
+                raise PolicyUnavailable("weights: the policy sleeps; give wake() the new values, or call it first")
+            with beside_acts(self._device):
+                yield
 
     def _forget_staged(self) -> None:
         self._staged = None

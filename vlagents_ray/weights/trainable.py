@@ -6,6 +6,7 @@ Torch and JAX are never imported here: their objects exist only if they have bee
 
 from __future__ import annotations
 
+import functools
 import hashlib
 import itertools
 import sys
@@ -22,7 +23,9 @@ from vlagents_ray.weights.pinned_copies import copy
 
 _BFLOAT16 = np.dtype("V2")
 _SHOWN = 5  # faults in a message
-_THREADS = 4  # threads that compute a fingerprint: hashing releases Python's lock
+_THREADS = 4  # threads that compute a fingerprint: numpy releases Python's lock
+_WORDS = 2**20  # 4-byte words of a value that are summed at once for a fingerprint; on a GPU that takes 40 MB
+_FACTOR = -7046029254386353131  # odd, of a fingerprint's sum before that of the next words
 _AT_ONCE = 2**24  # elements of a tensor for which operations on versions need further memory
 _KINDS = (("float", "bfloat"), ("int", "uint"), ("bool",), ("complex",))
 
@@ -270,8 +273,9 @@ def accepted(held: Mapping[str, Any], pushed: Mapping[str, Any], *, partial: boo
     places = {name: memory_of(name, value) for name, value in held.items()}
     last = {places[name]: name for name in pushed}
     new = {place: converted(pushed[name], held[name]) for place, name in last.items()}
-    faults = [name for place, name in last.items() if not _is_finite(new[place])]
-    _refuse([f"{name!r}: got NaN or infinite values, want finite ones" for name in faults])
+    finite = {name: _is_finite(new[place]) for place, name in last.items()}
+    finite |= _fetched({name: one for name, one in finite.items() if _is_tensor(one)})
+    _refuse([f"{name!r}: got NaN or infinite values, want finite ones" for name, is_so in finite.items() if not is_so])
     return {name: new[place] for name, place in places.items() if place in new}
 
 
@@ -324,14 +328,20 @@ def require_fit(held: Mapping[str, Any], pushed: Mapping[str, Any], *, partial: 
 def fingerprint(named: Mapping[str, Any]) -> str:
     """Return a digest of 32 hexadecimal characters over names, shapes, types and all bytes of values on any device.
 
-    A digest of a sample would be faster, but would not detect differences elsewhere.
+    It detects any accidental difference: each word is multiplied by two odd numbers, which depend on its place, and
+    summed modulo 2**64, on a GPU if the value is there. A cryptographic digest would need all values on the host, and
+    take a few seconds for a large model.
     """
     found = hashlib.blake2b(digest_size=16)
-    names = sorted(named)
+    on_gpus = {name: value for name, value in named.items() if _is_tensor(value) and value.is_cuda}
+    others = [name for name in named if name not in on_gpus]
     with ThreadPoolExecutor(_THREADS, "fingerprint") as threads:
-        for name, digest in zip(names, threads.map(_digest, (named[name] for name in names)), strict=True):
-            found.update(f"{name} {dtype_name(named[name])} {tuple(named[name].shape)}\n".encode())
-            found.update(digest)
+        sums = dict(zip(others, threads.map(_sums, (named[name] for name in others)), strict=True))
+    keys = dict[Any, Any]()
+    sums |= _fetched({name: _sums_on_gpu(value, keys) for name, value in on_gpus.items()})
+    for name in sorted(named):
+        found.update(f"{name} {dtype_name(named[name])} {tuple(named[name].shape)}\n".encode())
+        found.update(sums[name].tobytes())
     return found.hexdigest()
 
 
@@ -356,7 +366,8 @@ def _kind(dtype: str) -> Any:
     return next((kind for kind in _KINDS if dtype.startswith(kind)), dtype)
 
 
-def _is_finite(value: Any) -> bool:
+def _is_finite(value: Any) -> Any:
+    """Return whether all numbers are finite, a bool or a tensor of one."""
     if not dtype_name(value).startswith(("float", "bfloat", "complex")) or 0 in value.shape:
         return True
     if isinstance(value, np.ndarray):
@@ -367,7 +378,7 @@ def _is_finite(value: Any) -> bool:
         return bool(sys.modules["jax"].numpy.isfinite(value).all())
     if value.is_complex():
         value = sys.modules["torch"].view_as_real(value)
-    return all(bool(one.isfinite()) for one in value.aminmax())  # which need no memory, as above
+    return sys.modules["torch"].stack(value.aminmax()).isfinite().all()  # which needs no memory, as above
 
 
 def _is_equal(new: Any, held: Any) -> bool:
@@ -380,6 +391,44 @@ def _is_equal(new: Any, held: Any) -> bool:
     return all(bool((one == (converted(other, one) if moved else other)).all()) for one, other in parts)
 
 
-def _digest(value: Any) -> bytes:
+@functools.cache
+def _keys(count: int) -> np.ndarray:
+    """Return (2, count) odd int64 without a pattern, by the finalizer of splitmix64."""
+    key = np.arange(1, 2 * count + 1, dtype=np.uint64) * np.uint64(0x9E3779B97F4A7C15)
+    for shift, factor in ((30, 0xBF58476D1CE4E5B9), (27, 0x94D049BB133111EB)):
+        key = (key ^ (key >> np.uint64(shift))) * np.uint64(factor)
+    return ((key ^ (key >> np.uint64(31))) | np.uint64(1)).view(np.int64).reshape(2, count)
+
+
+def _sums(value: Any) -> np.ndarray:
+    """Return the two sums (2,) int64 of a value of the host."""
     data = np.ascontiguousarray(portable(value)).reshape(-1).view(np.uint8)
-    return hashlib.blake2b(data, digest_size=16).digest()  # type: ignore[arg-type]
+    words = (np.pad(data, (0, -len(data) % 4)) if len(data) % 4 else data).view(np.int32)
+    sums: np.ndarray = np.zeros(2, np.int64)
+    for begin in range(0, len(words), _WORDS):
+        part = words[begin : begin + _WORDS].astype(np.int64)
+        sums = sums * _FACTOR + _keys(_WORDS)[:, : len(part)] @ part
+    return sums
+
+
+def _sums_on_gpu(value: Any, keys: dict[Any, Any]) -> Any:
+    """Return those of a tensor on a GPU, as a tensor there; `keys` holds the result of `_keys` by device."""
+    torch, value = sys.modules["torch"], value.detach()
+    if value.device not in keys:
+        keys[value.device] = copy(torch.from_numpy(_keys(_WORDS)), value.new_empty((2, _WORDS), dtype=torch.int64))
+    data = value.reshape(-1).contiguous().view(torch.uint8)
+    if len(data) % 4 or data.storage_offset() % 4:
+        data = torch.nn.functional.pad(data, (0, -len(data) % 4))
+    sums = keys[value.device].new_zeros(2)
+    for part in data.view(torch.int32).split(_WORDS) if len(data) else ():
+        sums = sums * _FACTOR + (keys[value.device][:, : len(part)] * part.to(torch.int64)).sum(1)
+    return sums
+
+
+def _fetched(named: Mapping[str, Any]) -> dict[str, np.ndarray]:
+    """Return small tensors of equal shapes as arrays: one copy from each device waits for all of them."""
+    found: dict[str, np.ndarray] = {}
+    for device in {value.device for value in named.values()}:
+        own = {name: value for name, value in named.items() if value.device == device}
+        found.update(zip(own, on_host(sys.modules["torch"].stack([*own.values()])).numpy(), strict=True))
+    return found

@@ -22,6 +22,7 @@ from vlagents_ray.interface import DISTRIBUTION, SAMPLES, Act
 from vlagents_ray.policies.base import ModelConfig, ModelPolicy, Prediction, Row
 from vlagents_ray.policies.base.accelerator import (
     GPU_SHARE,
+    fetch,
     gpu_memory,
     is_device_failure,
     is_out_of_memory,
@@ -232,6 +233,20 @@ def acted(policy: Crowded, number: int, samples: int = 0) -> list[Act]:
     acts = policy.act_batch([view] * number, sessions)
     assert all(isinstance(act, Act) for act in acts)
     return acts  # type: ignore[return-value]
+
+
+def test_values_are_read_after_a_copy_that_does_not_wait_is_over(monkeypatch: pytest.MonkeyPatch) -> None:
+    values, on_host = torch.arange(6.0).view(2, 3), torch.zeros(2, 3)
+
+    def to(place: str, *, non_blocking: bool) -> torch.Tensor:
+        assert (place, non_blocking) == ("cpu", True)
+        return on_host
+
+    device = torch.device("cuda", 1)
+    streams = {device: SimpleNamespace(synchronize=lambda: on_host.copy_(values))}
+    monkeypatch.setattr(torch.cuda, "current_stream", streams.__getitem__)
+    np.testing.assert_array_equal(fetch(SimpleNamespace(device=device, to=to)), values.numpy())
+    np.testing.assert_array_equal(fetch(values), values.numpy())
 
 
 @pytest.mark.parametrize(("setting", "wanted"), [({}, "high"), ({"matmul": "highest"}, "highest")])

@@ -24,6 +24,7 @@ from vlagents_ray.policies.flow import FlowPasses
 from vlagents_ray.policies.loading import loading_report, report_device
 from vlagents_ray.protocol.messages import Reply, Request
 from vlagents_ray.serve.engine.engine import Engine
+from vlagents_ray.serve.models.checkpoints import Checkpoints
 from vlagents_ray.serve.weights import ModelWeights, PushOptions
 from vlagents_ray.weights.shared_values import _GpuMemory
 from vlagents_ray.weights.trainable import from_host, to_host
@@ -372,6 +373,26 @@ def test_an_act_that_waits_for_the_device_waits_for_the_end_of_a_capture(cuda: F
         assert captured_beside(cuda, lambda: ask(op)).error is None
     finally:
         engine.close()
+
+
+def test_another_checkpoint_is_loaded_on_another_stream_than_that_of_the_acts(cuda: FakeCuda) -> None:
+    streams: list[Any] = []
+
+    class Loading(Waiting):
+        def initialize(self) -> None:
+            streams.append(torch.cuda.current_stream())
+
+    engine = Engine(Checkpoints(lambda _: Loading(), {}, {"other": {"seed": 1}}, loaded=2))
+    replies: queue.SimpleQueue[Reply] = queue.SimpleQueue()
+    engine.start()
+    try:
+        submit(engine, "a", Request("reset", Obs(), kwargs={"checkpoint": "other"}), replies.put)
+        assert replies.get(timeout=10).error is None
+    finally:
+        engine.close()
+    first, second = streams
+    assert first is torch.cuda.current_stream()
+    assert second is not first
 
 
 def test_a_push_waits_for_the_end_of_a_capture(cuda: FakeCuda) -> None:

@@ -100,6 +100,34 @@ def test_a_group_comes_together_and_stays(clients: int) -> None:
     assert World(delays, patience=0.15).run(200).mean() > 0.95 * clients
 
 
+def large_model(size: int) -> float:
+    """A policy of which one batch saves as much over two as a robot may wait, s."""
+    return 0.040 + 0.011 * size
+
+
+def robot(seed: int, least: float = 0.003, most: float = 0.012) -> Delay:
+    """As one of several robots of a process, which encodes their images in turns."""
+    choose = random.Random(seed)
+    return lambda: choose.uniform(least, most)
+
+
+@pytest.mark.parametrize("robots", [2, 4, 8])
+def test_robots_that_act_at_once_come_together(robots: int) -> None:
+    world = {"delays": [robot(seed) for seed in range(robots)], "cost": large_model}
+    ranks = dict.fromkeys(range(robots), Rank.ROBOT)
+    assert World(**world, ranks=ranks, patience=0.0).run(200).mean() < 0.7 * robots
+    together = World(**world, ranks=ranks, patience=0.1).run(200)
+    assert together.mean() > 0.95 * robots
+    assert all(wait < large_model(robots) / 2 for wait, _ in together.waits)
+
+
+@pytest.mark.parametrize("others", [0, 1])
+def test_a_robot_with_a_rate_of_its_own_neither_waits_nor_is_waited_for(others: int) -> None:
+    delays = [robot(0, 0.1, 0.3), robot(1, 0.2, 0.4), *[robot(2)] * others]
+    world = World(delays, patience=0.1, cost=large_model, ranks=dict.fromkeys(range(3), Rank.ROBOT)).run(300)
+    assert world.waits == []
+
+
 def test_the_wait_is_bounded_by_the_batch_before() -> None:
     world = World([soon(seed) for seed in range(8)], patience=0.1).run(300)
     assert world.waits
@@ -131,14 +159,17 @@ def test_nobody_waits_where_batches_save_nothing() -> None:
     assert waited < 0.05 * sum(0.01 * size for size in world.sizes)
 
 
-def answered_together(*names: str, patience: float = 0.1) -> tuple[BatchWindow, FairQueue]:
-    """Three batches of 100 ms, the last over at 2.0; in between all were back after 2 ms."""
+def answered_together(
+    *names: str, patience: float = 0.1, robots: str = "", back_s: float = 0.002
+) -> tuple[BatchWindow, FairQueue]:
+    """Three batches of 100 ms, the last over at 2.0; in between all were back after `back_s`."""
     returning = BatchWindow(patience, SIZE, lambda name: name != "closed")
-    tickets = [ticket(name, 0.0) for name in names]
+    ranks = {name: Rank.ROBOT if name in robots else Rank.SIMULATION for name in names}
+    tickets = [ticket(name, 0.0, ranks[name]) for name in names]
     for end in (0.0, 1.0, 2.0):  # the first shows that the policy is slow
         returning.record_start(tickets)
         returning.record_end(end, 0.1)
-        tickets = [ticket(name, end + 0.002) for name in names]
+        tickets = [ticket(name, end + back_s, ranks[name]) for name in names]
         if end < 2.0:
             for one in tickets:
                 returning.record_arrival(one)
@@ -167,6 +198,34 @@ def test_a_robot_ends_the_wait_and_prevents_it() -> None:
     arrive(returning, waiting, robot := ticket("r", 2.002, Rank.ROBOT))
     assert returning.ends_wait(robot, waiting)
     assert returning.wait_s(2.002, waiting) == 0
+
+
+def test_robots_wait_for_robots_alone() -> None:
+    returning, waiting = answered_together("a", "b", "s", robots="ab")
+    arrive(returning, waiting, ticket("a", 2.001, Rank.ROBOT))
+    assert returning.wait_s(2.001, waiting) == pytest.approx(0.05)
+    arrive(returning, waiting, simulation := ticket("s", 2.002))
+    assert not returning.ends_wait(simulation, waiting)
+    arrive(returning, waiting, b := ticket("b", 2.003, Rank.ROBOT))
+    assert returning.ends_wait(b, waiting)
+    returning, waiting = answered_together("a", "s", robots="a")
+    arrive(returning, waiting, ticket("a", 2.001, Rank.ROBOT))
+    assert returning.wait_s(2.001, waiting) == 0
+
+
+def test_a_robot_that_came_for_the_first_time_ends_the_wait_of_robots() -> None:
+    returning, waiting = answered_together("a", "b", "c", robots="abc")
+    arrive(returning, waiting, ticket("a", 2.001, Rank.ROBOT))
+    assert returning.wait_s(2.001, waiting) > 0
+    arrive(returning, waiting, new := ticket("r", 2.002, Rank.ROBOT))
+    assert returning.ends_wait(new, waiting)
+
+
+def test_robots_do_not_wait_without_patience_or_for_longer_than_a_batch_saves() -> None:
+    for patience, back_s in ((0.0, 0.002), (0.1, 0.06)):  # half of the last batch is 0.05
+        returning, waiting = answered_together("a", "b", patience=patience, robots="ab", back_s=back_s)
+        arrive(returning, waiting, ticket("a", 2 + back_s, Rank.ROBOT))
+        assert returning.wait_s(2 + back_s, waiting) == 0
 
 
 def test_a_deadline_that_the_wait_would_endanger_prevents_it() -> None:

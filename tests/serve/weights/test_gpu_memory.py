@@ -14,7 +14,7 @@ from vlagents_ray.interface import Act, Agent, Obs
 from vlagents_ray.serve.weights import ModelWeights, PushOptions, WeightsVersion
 from vlagents_ray.weights import pinned_copies, trainable
 from vlagents_ray.weights.pinned_copies import copy
-from vlagents_ray.weights.trainable import are_apart, portable
+from vlagents_ray.weights.trainable import are_apart, fingerprint, portable
 
 pytestmark = pytest.mark.torch
 
@@ -29,6 +29,7 @@ def cuda(monkeypatch: pytest.MonkeyPatch) -> FakeCuda:
     fake = FakeCuda()
     fake.install(monkeypatch)
     monkeypatch.setattr(trainable, "_AT_ONCE", PART // 4)
+    monkeypatch.setattr(trainable, "_WORDS", PART // 40)
     monkeypatch.setattr(pinned_copies, "_PART", PART)
     monkeypatch.setattr(pinned_copies, "_USED", {})
     return fake
@@ -202,6 +203,37 @@ def test_copies_to_and_from_the_host_run_on_a_stream_of_their_own(cuda: FakeCuda
     [stream] = {stream for stream, _ in cuda.transfers}
     assert stream is not torch.cuda.current_stream()
     assert max(size for _, size in cuda.transfers) <= PART
+
+
+def test_no_operation_of_a_push_is_on_the_stream_of_the_acts(cuda: FakeCuda, monkeypatch: pytest.MonkeyPatch) -> None:
+    run, streams = cuda.run, set()
+
+    def noted(index: int, call: Any, inputs: Any) -> Any:
+        streams.add(cuda.current_stream(index))
+        return run(index, call, inputs)
+
+    pushed = Pushed(cuda, OnGpu(cuda))
+    sessions = [pushed.begin(follows=True), pushed.begin(follows=False)]
+    monkeypatch.setattr(cuda, "run", noted)
+    for number in (1, 2):
+        pushed.push(number)
+        for session in sessions:
+            pushed.weights.use(session.weights)  # type: ignore[arg-type]
+    assert streams
+    assert torch.cuda.current_stream() not in streams
+
+
+def test_the_fingerprint_is_the_same_on_a_gpu(cuda: FakeCuda) -> None:
+    for dtype in (torch.float32, torch.bfloat16, torch.uint8, torch.int64):
+        values = {str(length): (100 * torch.randn(length)).to(dtype) for length in (0, 1, 9, 10, 11, 500, 1234)}
+        found = fingerprint(values)
+        assert fingerprint({name: cuda.tensor(value) for name, value in values.items()}) == found
+        assert (
+            fingerprint({name: value.numpy() for name, value in values.items() if dtype != torch.bfloat16} or values)
+            == found
+        )
+        values["500"][[3, 400]] = values["500"][[400, 3]] + 1
+        assert fingerprint({name: cuda.tensor(value) for name, value in values.items()}) != found
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.bfloat16, torch.int64])

@@ -15,6 +15,8 @@ from contextlib import AbstractContextManager, contextmanager, nullcontext, supp
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from vlagents_ray.errors import ConfigError
 from vlagents_ray.policies.base import import_fixes
 from vlagents_ray.policies.base.config import DType, Matmul
@@ -174,6 +176,19 @@ def set_matmul(precision: Matmul, device: dict[str, Any]) -> None:
         torch.set_float32_matmul_precision(precision)
         torch.backends.cudnn.allow_tf32 = precision == "high"
     device["matmul"] = precision
+
+
+def fetch(tensor: Any) -> np.ndarray:
+    """Return the values of a tensor as an array, after the work that computes them.
+
+    Meanwhile other threads should use the GPU, to prepare the next batch or to load weights. During `Tensor.cpu`, whose
+    copy is to pageable memory, each of their calls of CUDA waited for all of that work (torch 2.11, H200).
+    """
+    if tensor.device.type != "cuda":
+        return np.asarray(tensor.cpu())
+    on_host = tensor.to("cpu", non_blocking=True)  # to pinned memory
+    require("torch").cuda.current_stream(tensor.device).synchronize()
+    return np.asarray(on_host)
 
 
 def is_out_of_memory(error: BaseException) -> bool:

@@ -16,6 +16,7 @@ from vlagents_ray.contract import Contract, StateSpec
 from vlagents_ray.dataset_contract import DatasetContract
 from vlagents_ray.errors import ConfigError
 from vlagents_ray.policies.base import Row, shared_frames
+from vlagents_ray.policies.base.accelerator import fetch
 from vlagents_ray.policies.base.model_inputs import GRIPPER
 from vlagents_ray.policies.base.staging import Staging
 from vlagents_ray.policies.compilation import Compilation
@@ -547,7 +548,7 @@ class Tdmpc(Kind):
         actions = policy.plan(latent) if self.config.use_mpc else policy.model.pi(latent)[None]  # (horizon, 1, D)
         actions = actions.clamp(-1, 1)
         if policy._prev_mean is not None:
-            row.memory["mean"] = policy._prev_mean.cpu().numpy()
+            row.memory["mean"] = fetch(policy._prev_mean)
         repeats = self.config.n_action_repeats
         return (actions[:1].expand(repeats, -1, -1) if repeats > 1 else actions).transpose(0, 1)
 

@@ -13,6 +13,7 @@ import numpy as np
 from vlagents_ray.dataset_contract import BYTES, STATISTICS, DatasetContract
 from vlagents_ray.errors import ConfigError, MissingDependency
 from vlagents_ray.policies.base import Row
+from vlagents_ray.policies.base.accelerator import fetch
 from vlagents_ray.policies.base.model_code import CURE
 from vlagents_ray.policies.base.model_inputs import keeping_tokens
 from vlagents_ray.policies.base.staging import Staging
@@ -144,9 +145,9 @@ class Processors:
     def actions(self, chunks: Any) -> np.ndarray:
         """Convert the policy's actions (B, T, D) to (B, T, D') float32, in the robot's units."""
         if self.whole:
-            return np.asarray(self._after(chunks.float()).float().cpu())
+            return fetch(self._after(chunks.float()).float())
         flat = self._after(chunks.float().flatten(0, 1))  # rows, as in LeRobot's own loop
-        return np.asarray(flat.unflatten(0, chunks.shape[:2]).float().cpu())
+        return fetch(flat.unflatten(0, chunks.shape[:2]).float())
 
     @property
     def invertible(self) -> bool:

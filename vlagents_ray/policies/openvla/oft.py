@@ -16,6 +16,7 @@ from vlagents_ray.contract import Contract
 from vlagents_ray.errors import ConfigError, InvalidObservation
 from vlagents_ray.interface import Obs
 from vlagents_ray.policies.base import Row
+from vlagents_ray.policies.base.accelerator import fetch
 from vlagents_ray.policies.base.model_inputs import (
     camera_images,
     camera_specs,
@@ -231,7 +232,7 @@ class Parallel:
 
     def regress(self, inputs: Sequence[ModelInput]) -> np.ndarray:
         with require("torch").inference_mode():
-            return _numpy(self._heads(self._hidden(self._sequences(inputs))))
+            return fetch(self._heads(self._hidden(self._sequences(inputs))).float())
 
     def denoise(self, inputs: Sequence[ModelInput], owners: Sequence[int], noise: np.ndarray) -> np.ndarray:
         """Denoise chunks (B, H, D) in [-1, 1] from standard normal noise, for the inputs `owners` (B,)."""
@@ -240,7 +241,7 @@ class Parallel:
             index = self.base.moved(owners)
             sequences = Sequences(*(part[index] for part in sequences))
             start = self.base.moved(noise).to(self.base.dtype)
-            return _numpy(denoise(start, lambda time, noisy: self._noise(sequences, time, noisy), *self.steps))
+            return fetch(denoise(start, lambda time, noisy: self._noise(sequences, time, noisy), *self.steps).float())
 
     def choose(self, inputs: Sequence[ModelInput], owners: Sequence[int], draws: np.ndarray) -> tuple[Any, Any]:
         """Choose tokens (B, H, D) for the inputs `owners` (B,), by draws (B, H, D) as in `ActionBins.choose`.
@@ -311,11 +312,6 @@ class Parallel:
         # the preceding token predicts an action, as in training
         places = lengths[:, None] - count - 2 + require("torch").arange(count, device=self.base.device)
         return hidden.take_along_dim(places[..., None], 1)
-
-
-def _numpy(tensor: Any) -> np.ndarray:
-    array: np.ndarray = tensor.float().cpu().numpy()
-    return array
 
 
 def denoise(noise: Any, predict: Callable[[int, Any], Any], trained: int, steps: int) -> Any:

@@ -27,7 +27,7 @@ from vlagents_ray.contract import ActionSpec
 from vlagents_ray.errors import ConfigError, InvalidObservation, NotReset
 from vlagents_ray.interface import Obs
 from vlagents_ray.policies.base import ModelConfig, ModelPolicy, Prediction, Row
-from vlagents_ray.policies.base.accelerator import ensure_torchvision, torch_device, torch_dtype
+from vlagents_ray.policies.base.accelerator import ensure_torchvision, fetch, torch_device, torch_dtype
 from vlagents_ray.policies.base.checkpoint import SavedTensors, find_checkpoint, require_loaded
 from vlagents_ray.policies.base.model_inputs import keeping_tokens
 from vlagents_ray.policies.base.staging import StagedRow, Staging
@@ -317,7 +317,7 @@ class ActionBins:
         spread = (share * (self._middles - mean[..., None]) ** 2).sum(-1).sqrt()
         logprob = over.log_softmax(-1).gather(-1, bins[..., None])[..., 0]
         entropy = torch.special.entr(share).sum(-1)
-        return np.asarray(torch.stack([self._middles[bins], mean, spread, logprob, entropy, tokens.double()]).cpu())
+        return fetch(torch.stack([self._middles[bins], mean, spread, logprob, entropy, tokens.double()]))
 
 
 MODEL, PROCESSOR = "OpenVLAForActionPrediction", "PrismaticImageProcessor"

@@ -90,7 +90,8 @@ class BatchArgs(_DeploymentModel):
         ge=0,
         le=1,
         description="how long a batch may wait for simulations that were in the batch before and are coming back, as "
-        "a share of that batch's duration; 0 never waits. No robot waits, nor does a lone session",
+        "a share of that batch's duration; robots that act again at once wait for one another while that saves time. 0 "
+        "never waits, nor does a lone session",
     )
 
     @model_validator(mode="after")

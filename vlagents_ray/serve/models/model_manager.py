@@ -29,6 +29,7 @@ from vlagents_ray.serve.models.loaded_model import LoadedModel, Loader, key_of
 from vlagents_ray.serve.requests import DEFAULT, CheckpointChoice
 from vlagents_ray.serve.sessions import Session, SessionTable
 from vlagents_ray.serve.weights import ModelWeights
+from vlagents_ray.weights.pinned_copies import beside_acts
 
 PATIENCE_S = 10.0  # waiting time for a slot after which a checkpoint in use accepts no more episodes
 
@@ -456,7 +457,8 @@ class ModelManager:
     def _load(self, task: LoadTask) -> None:
         begun = time.monotonic()
         try:
-            model = self._loader.load(task.choice, task.settings)
+            with beside_acts(None):
+                model = self._loader.load(task.choice, task.settings)
         except BaseException as error:
             logger.exception("%s did not load", task.choice)
             failure = f"{task.choice} did not load: {type(error).__name__}; the server's log says why"

@@ -5,7 +5,7 @@ to the batch limit, so that batching never delays a lone request. `vlagents_ray.
 order. Expired and finished requests never reach the policy, but are only dropped when it is next free; a caller that
 needs an earlier notice of its expired deadline sets a timer.
 
-The queue waits for the remaining requests of a group of simulations that were answered together and are about to send
+The queue waits for the remaining requests of a group of sessions that were answered together and are about to send
 their next requests. `vlagents_ray.serve.queue.batch_window` decides when and for how long. `patience=0` disables this.
 """
 

@@ -9,9 +9,12 @@ conditions:
   that batch. It does not wait again for a session that was late before that session has returned in time once.
 - The wait is at most `patience` times the duration of the last batch. It is also at most the time that one batch saves
   over two: the fixed cost of a batch, estimated from the durations of the last batches.
-- No robot's request waits, the waiting requests do not fill the batch already, and the wait endangers no deadline.
+- No robot waits for simulations, the wait endangers no deadline, and the waiting requests do not fill the batch.
 
-So a lone session does not wait for others, and a robot never waits. The queue does not wait for robots either.
+Robots that act as soon as they are answered, such as those behind their rate, are split in the same way, and each of
+their acts then takes two batches. So they wait for one another for as long as one batch saves over two, at most half of
+the last batch. Robots whose usual return time is longer than that have a rate of their own: they neither wait nor are
+waited for. A lone session never waits.
 """
 
 from __future__ import annotations
@@ -25,21 +28,23 @@ from vlagents_ray.serve.requests import PendingRequest, Rank
 _KEPT = 0.95  # factor by which the weight of a batch decreases with each later batch
 _SPREAD = 0.01  # variance of the batch sizes below which the fixed cost cannot be estimated
 _NEWEST = 0.25  # weight of the last batch in the mean duration of batches
+# Longest wait of robots for one another, as a share of the last batch: usual policies save less, and it bounds the wait
+# while the fixed cost is not known. Eight robots of one process return within 30 ms, more than `patience` allows.
+_ROBOTS = 0.5
 SLOW_S = 0.002  # a shorter batch ends before a wait could pay off, or another thread could wake up
 
 
 class _AnsweredBatch:
-    """The simulations of a batch, and the recent return time of each, s; None if it is unknown.
+    """The sessions of a batch by class, and the recent return time of each, s; None if it is unknown.
 
     The return time of a session is the time from an answer to its next request.
     """
 
     def __init__(self, batch: Sequence[PendingRequest]) -> None:
-        self.returns = {
-            pending.session_id: pending.return_s
-            for pending in batch
-            if pending.rank is Rank.SIMULATION and pending.request.op in ("act", "reset")
-        }
+        self.returns: dict[Rank, dict[str, float | None]] = {rank: {} for rank in Rank}
+        for pending in batch:
+            if pending.request.op in ("act", "reset"):
+                self.returns[pending.rank][pending.session_id] = pending.return_s
         self.lone = batch[0].session_id if len(batch) == 1 else ""
         self.acts = len(batch) if all(pending.request.op == "act" for pending in batch) else 0
         self.ended = math.inf  # s
@@ -88,7 +93,8 @@ class BatchWindow:
         self.overlaps = False
         self._cost = BatchCost()
         self._missing: set[str] = set()
-        self._until = 0.0
+        self._rank = Rank.SIMULATION  # of the missing sessions
+        self._bound = self._until = 0.0  # the longest wait, s, and its end
 
     def record_start(self, batch: Sequence[PendingRequest]) -> None:
         """Record that a batch begins."""
@@ -111,40 +117,47 @@ class BatchWindow:
         The estimate rises to a longer time at once, and falls to a shorter one by half the difference.
         """
         for answered in (self._last, self._previous):
-            if pending.session_id in answered.returns:
-                usual = answered.returns.pop(pending.session_id)
+            returns = answered.returns[pending.rank]
+            if pending.session_id in returns:
+                usual = returns.pop(pending.session_id)
                 took = max(0.0, pending.arrived - answered.ended)
                 pending.return_s = took if usual is None or took > usual else (took + usual) / 2
                 return
 
     def wait_s(self, now: float, waiting: FairQueue) -> float:
         """Return how long the free policy may wait for further requests, s; every `put` then calls `ends_wait`."""
-        bound = min(self._patience * self._duration, self._cost.fixed_s())
-        if bound <= 0 or not self.slow or waiting.depth[Rank.ROBOT] or waiting.sessions >= self._size:
+        self._rank = Rank.ROBOT if waiting.depth[Rank.ROBOT] else Rank.SIMULATION
+        robots = self._rank is Rank.ROBOT
+        patience = max(_ROBOTS, self._patience) if robots and self._patience else self._patience
+        bound = self._bound = min(patience * self._duration, self._cost.fixed_s())
+        if bound <= 0 or not self.slow or waiting.sessions >= self._size:
             return 0.0
         self._missing = {
             session_id
-            for session_id, return_s in self._last.returns.items()
+            for session_id, return_s in self._last.returns[self._rank].items()
             if return_s is not None
             and abs(self._last.ended + return_s - now) <= bound
+            and not (robots and return_s > bound)
             and session_id not in waiting
             and self._is_open(session_id)
         }
         self._until = now + bound
-        if not self._missing or any(self._risks_deadline(pending) for pending in waiting.heads()):
+        if not self._missing or any(self._must_not_wait(pending) for pending in waiting.heads()):
             return 0.0
         return bound
 
     def ends_wait(self, pending: PendingRequest, waiting: FairQueue) -> bool:
         """Return whether the arrival of this request ends the wait."""
         self._missing.discard(pending.session_id)
-        return (
-            not self._missing
-            or pending.rank is Rank.ROBOT
-            or waiting.sessions >= self._size
-            or self._risks_deadline(pending)
-        )
+        return not self._missing or waiting.sessions >= self._size or self._must_not_wait(pending)
 
-    def _risks_deadline(self, pending: PendingRequest) -> bool:
-        """Return whether the deadline may pass if the policy waits, and then takes as long as for the last batch."""
+    def _must_not_wait(self, pending: PendingRequest) -> bool:
+        """Return whether a request prevents the wait, for its robot, or for its deadline.
+
+        The deadline may pass if the policy waits, and then takes as long as for the last batch.
+        """
+        if pending.rank is Rank.ROBOT:
+            at_once = pending.return_s is not None and pending.return_s <= self._bound
+            if self._rank is not Rank.ROBOT or not at_once:
+                return True
         return pending.deadline < self._until + self._duration
