@@ -92,52 +92,35 @@ def test_served_flights_are_those_in_process_to_the_bit(server: Server) -> None:
     np.testing.assert_array_equal(served, fly(range(FLIGHTS), together(loaded(), FLIGHTS), STEPS))
 
 
-@pytest.fixture
-def fleet(server: Server) -> Iterator[dict[RemoteAgent, int]]:
-    """Two clients of each transport, and the processes of their replicas, two for each transport."""
-    scale(2)
-    agents: dict[RemoteAgent, int] = {}
-    for transport in TRANSPORTS:
-        pair = [client(server, transport) for _ in range(2)]
-
-        def spread(pair: list[RemoteAgent] = pair) -> bool:
-            for agent in pair:
-                agent.close()
-                agents[agent] = agent.reset(START)["pid"]
-            return agents[pair[0]] != agents[pair[1]]
-
-        wait_for(spread)
-    yield agents
-    for agent in agents:
-        agent.close()
-
-
-def test_a_killed_replica_costs_no_flight(fleet: dict[RemoteAgent, int]) -> None:
-    """The clients say which sessions began again, and these act as the reference does."""
-    inputs, wanted = reference()
-    killed = next(iter(fleet.values()))
-    for i, row in enumerate(inputs[:300, 0]):
-        if i == 200:
-            os.kill(killed, signal.SIGKILL)
-        for agent, pid in fleet.items():
-            act = agent.act(observation(row))
-            assert ("resumed" in act.info) == (i == 200 and pid == killed), (i, agent.transport)
-            assert np.abs(act.action - wanted[i, 0]).max() < TOLERANCE, (i, agent.transport)
-
-
 @pytest.mark.parametrize("transport", TRANSPORTS)
-def test_a_killed_replica_is_an_error_where_sessions_are_not_resumed(server: Server, transport: TransportName) -> None:
+def test_a_killed_replica_costs_no_flight(server: Server, transport: TransportName) -> None:
+    """The client says that the session began again, and it acts as the reference does."""
     scale(2)
-    with client(server, transport, resume=False) as agent:
+    inputs, wanted = reference()
+    with client(server, transport) as agent:
         pid = agent.reset(START)["pid"]
-        agent.act(START)
+        for i, row in enumerate(inputs[:300, 0]):
+            if i == 200:
+                os.kill(pid, signal.SIGKILL)
+            act = agent.act(observation(row))
+            assert ("resumed" in act.info) == (i == 200), i
+            assert np.abs(act.action - wanted[i, 0]).max() < TOLERANCE, i
+
+
+def test_a_killed_replica_is_an_error_where_sessions_are_not_resumed(server: Server) -> None:
+    scale(2)
+    with client(server, "websocket", resume=False) as agent:
+        pid = agent.reset(START)["pid"]
         os.kill(pid, signal.SIGKILL)
         wait_for(lambda: not psutil.pid_exists(pid))
         with pytest.raises(ConnectionLost):
             agent.act(START)
 
 
-def test_flights_go_on_to_the_bit_while_a_replica_stops(fleet: dict[RemoteAgent, int]) -> None:
+def test_flights_go_on_to_the_bit_while_a_replica_stops(server: Server) -> None:
+    scale(2)
+    agents = [client(server, transport) for transport in TRANSPORTS for _ in range(2)]
+    wait_for(lambda: len({agent.reset(START)["pid"] for agent in agents if agent.close() is None}) == 2)
     scaling = threading.Thread(target=scale, args=(1,))
     steps = itertools.count()
 
@@ -147,10 +130,12 @@ def test_flights_go_on_to_the_bit_while_a_replica_stops(fleet: dict[RemoteAgent,
                 scaling.start()
             case 400:
                 scaling.join()
-        found = [agent.act(one) for agent, one in zip(fleet, obs, strict=True)]
+        found = [agent.act(one) for agent, one in zip(agents, obs, strict=True)]
         assert not any("resumed" in act.info for act in found)
         return found
 
-    served = fly(range(len(fleet)), acts, STEPS)
+    served = fly(range(len(agents)), acts, STEPS)
     assert states(APP) == {"RUNNING": 1}
-    np.testing.assert_array_equal(served, fly(range(len(fleet)), together(loaded(), len(fleet)), STEPS))
+    for agent in agents:
+        agent.close()
+    np.testing.assert_array_equal(served, fly(range(len(agents)), together(loaded(), len(agents)), STEPS))
