@@ -99,7 +99,7 @@ def test_it_carries_the_reference_of_a_recurrent_policy(client: Path, tmp_path: 
         const actions = [];
         for (const pair of rows) {
           const acts = await Promise.all(agents.map((agent, i) => agent.act(pair[i])));
-          actions.push(acts.map((act) => Array.from(act.action.data ?? act.action)));
+          actions.push(acts.map(({ rows: [action] }) => Array.from(action)));
         }
         for (const agent of agents) await agent.close();
         console.log(JSON.stringify(actions));
