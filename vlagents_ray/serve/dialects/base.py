@@ -508,6 +508,9 @@ class HttpDialect(RouteDialect):
         if engine.finder is None or session_id in engine.sessions:
             return
         loop, over = asyncio.get_running_loop(), asyncio.Event()
-        searcher = caller.name if isinstance(caller, Caller) else ""
-        if engine.finder.fetch(session_id, lambda: loop.call_soon_threadsafe(over.set), searcher):
+
+        def finished() -> None:
+            loop.call_soon_threadsafe(over.set)
+
+        if engine.finder.fetch(session_id, finished, caller.name if isinstance(caller, Caller) else ""):
             await over.wait()
