@@ -22,10 +22,7 @@ INPUTS = {  # in the order of the network's 22 inputs
 
 
 class Raptor(Agent):
-    """A network of 2,084 parameters with a gated recurrent unit (GRU).
-
-    An action sets the speed of each motor, -1 to 1: front right, back right, back left, front left.
-    """
+    """A gated recurrent unit (GRU) between dense layers; an action is the motors' speeds, clockwise from front right."""
 
     trainable = "weights"
     # A resumed session gets its last 128 observations again: the GRU forgets earlier ones, and acts as before to 3e-7.
