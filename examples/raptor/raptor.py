@@ -22,7 +22,7 @@ INPUTS = {  # in the order of the network's 22 inputs
 
 
 class Raptor(Agent):
-    """A gated recurrent unit (GRU) between dense layers; an action is the motors' speeds, clockwise from front right."""
+    """A gated recurrent unit (GRU) between dense layers; an action sets the motors clockwise from front right."""
 
     trainable = "weights"
     # A resumed session gets its last 128 observations again: the GRU forgets earlier ones, and acts as before to 3e-7.
