@@ -69,15 +69,16 @@ class Quadrotors:
         state: (17, N), the position, m; the orientation, a quaternion wxyz; the velocity, m/s; the angular velocity in
             the body's axes, rad/s; and the speeds of the rotors in [0, 1].
         action: (4, N), the last action; at first the one that holds the rotors' speeds.
+        parameters: The values of the quadrotors by name, each (N,), in the units of `sample`.
     """
 
     def __init__(self, seeds):
         """Begin a flight for each seed, which determines the quadrotor and its start."""
         drawn = [sample(np.random.default_rng(seed)) for seed in seeds]
-        self._of = {name: np.array([quadrotor[name] for quadrotor, _ in drawn]) for name in drawn[0][0]}
+        self.parameters = {name: np.array([quadrotor[name] for quadrotor, _ in drawn]) for name in drawn[0][0]}
         self.state = np.stack([state for _, state in drawn], axis=1)
         self.action = 2 * self.state[13:] - 1
-        self.radius = np.sqrt(2) * self._of["arm"]  # (N,), distance of the rotors from the centre, m
+        self.radius = np.sqrt(2) * self.parameters["arm"]  # (N,), distance of the rotors from the centre, m
 
     def step(self, action, flying=True):
         """Fly for `DT` with an action, (4, N), which sets the rotors' speeds: -1 is 0 and 1 is 1.
@@ -97,16 +98,16 @@ class Quadrotors:
         self.state = np.where(flying, state, self.state)
 
     def _derivative(self, state, command):
-        of = self._of
+        body = self.parameters
         (w, x, y, z), (p, q, r), rotors = state[3:7], state[10:13], state[13:]
         # The rotors are at front right, back right, back left and front left.
-        t0, t1, t2, t3 = of["thrust"] * (THRUST[0] + THRUST[1] * rotors + THRUST[2] * rotors * rotors)
+        t0, t1, t2, t3 = body["thrust"] * (THRUST[0] + THRUST[1] * rotors + THRUST[2] * rotors * rotors)
         lift = t0 + t1 + t2 + t3
-        torque_x = of["arm"] * (-t0 - t1 + t2 + t3)
-        torque_y = of["arm"] * (-t0 + t1 + t2 - t3)
-        torque_z = of["torque_constant"] * (-t0 + t1 - t2 + t3)
-        jx, jy, jz = (of["inertia"] * ratio for ratio in INERTIA)
-        time_constant = np.where(command >= rotors, of["rising"], of["falling"])
+        torque_x = body["arm"] * (-t0 - t1 + t2 + t3)
+        torque_y = body["arm"] * (-t0 + t1 + t2 - t3)
+        torque_z = body["torque_constant"] * (-t0 + t1 - t2 + t3)
+        jx, jy, jz = (body["inertia"] * ratio for ratio in INERTIA)
+        time_constant = np.where(command >= rotors, body["rising"], body["falling"])
         return np.stack(
             [
                 *state[7:10],
@@ -114,9 +115,9 @@ class Quadrotors:
                 0.5 * (w * p + y * r - z * q),
                 0.5 * (w * q + z * p - x * r),
                 0.5 * (w * r + x * q - y * p),
-                ((2 * x * z + 2 * w * y) * lift + of["force_x"]) / of["mass"],
-                ((2 * y * z - 2 * w * x) * lift + of["force_y"]) / of["mass"],
-                ((1 - 2 * x * x - 2 * y * y) * lift + of["force_z"]) / of["mass"] - GRAVITY,
+                ((2 * x * z + 2 * w * y) * lift + body["force_x"]) / body["mass"],
+                ((2 * y * z - 2 * w * x) * lift + body["force_y"]) / body["mass"],
+                ((1 - 2 * x * x - 2 * y * y) * lift + body["force_z"]) / body["mass"] - GRAVITY,
                 (torque_x - (jz - jy) * q * r) / jx,
                 (torque_y - (jx - jz) * r * p) / jy,
                 (torque_z - (jy - jx) * p * q) / jz,

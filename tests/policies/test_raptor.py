@@ -130,18 +130,18 @@ def test_a_crashed_quadrotor_stays_where_it_is_while_the_others_fly_on() -> None
 def test_a_quadrotor_obeys_gravity_and_thrust() -> None:
     """Without thrust a quadrotor falls as a stone does; level and with the thrust of its weight it stays."""
     flights = Quadrotors([0, 1, 2])
-    of = flights._of
+    body = flights.parameters
     for axis in "xyz":
-        of[f"force_{axis}"] = np.zeros(3)
+        body[f"force_{axis}"] = np.zeros(3)
     flights.state = np.zeros((17, 3))
     flights.state[3] = 1
     falling = Quadrotors([0, 1, 2])
-    falling._of |= of | {"thrust": np.zeros(3)}
+    falling.parameters |= body | {"thrust": np.zeros(3)}
     falling.state = flights.state
     for _ in range(100):
         falling.step(-np.ones((4, 3)))
     np.testing.assert_allclose(falling.state[2], -9.81 / 2, rtol=1e-9)
-    a, b, c = (9.223048e-2, 1.437313e-2, 3.52526e-3 - 0.11012887 * of["mass"] * 9.81 / (4 * of["thrust"]))
+    a, b, c = (9.223048e-2, 1.437313e-2, 3.52526e-3 - 0.11012887 * body["mass"] * 9.81 / (4 * body["thrust"]))
     speed = (-b + np.sqrt(b * b - 4 * a * c)) / (2 * a)
     flights.state[13:] = speed
     for _ in range(100):
