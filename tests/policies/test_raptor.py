@@ -91,6 +91,25 @@ def test_a_session_of_a_killed_replica_says_so_and_acts_as_before(steps: int, re
     assert np.abs(act.action - wanted[steps, 0]).max() < TOLERANCE
 
 
+def test_the_observations_that_a_client_keeps_stand_for_the_whole_flight(policy: Raptor) -> None:
+    """Of `history` observations the last one has no answer yet."""
+    flights, seen = 100, []
+    whole, batch = together(policy, flights), HoverBatch(flights)
+    obs = batch.reset(seeds=range(flights))
+    for _ in range(250):
+        seen.append(obs)
+        acts = whole(obs)
+        obs, *_ = batch.step(acts)
+    errors = {}
+    for kept in (32, policy.contract.history):
+        again = together(policy, flights)
+        for row in seen[-kept:]:
+            late = again(row)
+        errors[kept] = max(np.abs(one.action - two.action).max() for one, two in zip(acts, late, strict=True))
+    print(f"largest difference of an action by the number of observations: {errors}")
+    assert errors[policy.contract.history] < TOLERANCE < errors[32]
+
+
 def test_a_session_that_must_not_be_resumed_gets_an_error(replicas: Replicas) -> None:
     with replicas.agent(resume=False) as agent:
         agent.reset(START, None)
