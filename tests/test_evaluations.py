@@ -34,7 +34,7 @@ ELSEWHERE = {
 }  # defaults that are said in words
 
 
-@pytest.mark.parametrize("file", FILES, ids=lambda file: file.stem)
+@pytest.mark.parametrize("file", [*FILES, ROOT / "examples" / "raptor" / "flights.yaml"], ids=lambda file: file.stem)
 def test_an_example_is_accepted(file: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(ROOT)
     config = EvalConfig.model_validate(read_run(file))

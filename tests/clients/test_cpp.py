@@ -18,13 +18,15 @@ from typing import Any
 
 import numpy as np
 import pytest
-from asgi_server import served
+from asgi_server import policy_server, served
 from cpp_client import CppClient, CppError, build
 from eval_fakes import wait_for
 from golden import GOLDEN, of_request
 from hostile_messages import ADDED_MB, ANSWERS
 from in_flight import read_requests
 from in_memory_keys import ChangingKeys
+from raptor import Raptor
+from raptor_flights import TOLERANCE, observation, reference
 from websockets.datastructures import Headers
 from websockets.exceptions import ConnectionClosed
 from websockets.http11 import Request as HttpRequest
@@ -248,6 +250,18 @@ def refused(client: CppClient, do: str = "act", **arguments: Any) -> CppError:
     with pytest.raises(CppError) as error:
         client.call(do, **arguments)
     return error.value
+
+
+def test_it_carries_the_reference_of_a_recurrent_policy(programs: Path) -> None:
+    inputs, wanted = reference()
+    with policy_server(Raptor()) as port, CppClient(programs, f"http://127.0.0.1:{port}") as client:
+        for sequence in range(2):
+            rows = [
+                {name: part.tolist() for name, part in observation(row).state.items()} for row in inputs[:, sequence]
+            ]
+            client.reset(state=rows[0])
+            actions = [client.act(state=row)["values"] for row in rows]
+            assert np.abs(np.array(actions) - wanted[:, sequence]).max() < TOLERANCE
 
 
 # Frames

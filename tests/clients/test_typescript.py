@@ -8,10 +8,14 @@ import subprocess
 from collections.abc import Iterator
 from pathlib import Path
 
+import numpy as np
 import pytest
 import typescript_client
+from asgi_server import policy_server
 from client_servers import client_servers
 from hostile_messages import ADDED_MB, ANSWERS
+from raptor import Raptor
+from raptor_flights import TOLERANCE, observation, reference
 
 pytestmark = pytest.mark.node
 
@@ -79,6 +83,32 @@ def test_no_answer_fills_the_memory_of_a_robots_computer(client: Path, tmp_path:
     assert added_mb < ADDED_MB
     assert len(outcomes) == len(ANSWERS)
     assert set(outcomes.values()) == {"read", "malformed"}
+
+
+def test_it_carries_the_reference_of_a_recurrent_policy(client: Path, tmp_path: Path) -> None:
+    inputs, wanted = reference()
+    rows = [[{"state": {n: p.tolist() for n, p in observation(row).state.items()}} for row in pair] for pair in inputs]
+    (tmp_path / "observations").write_text(json.dumps(rows))
+    script = """
+        import { readFileSync } from "node:fs";
+        import { RemoteAgent } from "vlagents-ray";
+        const [url, file] = process.argv.slice(1);
+        const rows = JSON.parse(readFileSync(file));
+        const agents = [new RemoteAgent(url), new RemoteAgent(url)];
+        for (const [i, agent] of agents.entries()) await agent.reset(rows[0][i]);
+        const actions = [];
+        for (const pair of rows) {
+          const acts = await Promise.all(agents.map((agent, i) => agent.act(pair[i])));
+          actions.push(acts.map(({ rows: [action] }) => Array.from(action)));
+        }
+        for (const agent of agents) await agent.close();
+        console.log(JSON.stringify(actions));
+    """
+    with policy_server(Raptor()) as port:
+        said = node(
+            client, "--input-type=module", "-e", script, f"http://127.0.0.1:{port}", str(tmp_path / "observations")
+        )
+    assert np.abs(np.array(json.loads(said)) - wanted).max() < TOLERANCE
 
 
 def test_its_example_runs(client: Path, servers: dict[str, str]) -> None:

@@ -40,11 +40,16 @@ def serving(
 ) -> Iterator[tuple[TestClient, Engine]]:
     engine = Engine(agent, **options)
     engine.start()
-    routes = dialect_routes(DialectArgs(**dialects), ReplicaContext(engine, lambda: METADATA, LIMITS))
-    inside = build_http_app(engine, lambda: METADATA, LIMITS, dialects=routes)
-    with TestClient(AccessMiddleware(inside, keys, "app")) as client:
+    with client_of(engine, dialects, keys) as client:
         yield client, engine
     engine.close()
+
+
+def client_of(engine: Engine, dialects: dict[str, Any], keys: Keys | None = None) -> TestClient:
+    """A client of the dialects over an engine."""
+    routes = dialect_routes(DialectArgs(**dialects), ReplicaContext(engine, lambda: METADATA, LIMITS))
+    inside = build_http_app(engine, lambda: METADATA, LIMITS, dialects=routes)
+    return TestClient(AccessMiddleware(inside, keys, "app"))
 
 
 def image(pixel: int) -> np.ndarray:

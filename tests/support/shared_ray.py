@@ -22,7 +22,8 @@ from vlagents_ray.serve.ports import LOOPBACK, free_port, keep
 FIXTURE = "shared_ray"
 _CPUS = 4  # only an account: replicas, and workers of evaluations
 _READY_S = 180.0  # for a policy to be ready; the machine may be busy
-_SUPPORT = Path(__file__).parent
+# Policies that tests serve: their own, and those of an example with several files.
+_POLICIES = (Path(__file__).parent, Path(__file__).parents[2] / "examples" / "raptor")
 
 _running: contextlib.ExitStack | None = None
 _port = 0  # of Serve's HTTP
@@ -39,7 +40,7 @@ def start() -> None:
     with contextlib.ExitStack() as stack:
         patch = stack.enter_context(pytest.MonkeyPatch.context())
         patch.setenv("RAY_metrics_report_interval_ms", "500")  # instead of 10 s, for which tests would wait
-        patch.setenv("PYTHONPATH", str(_SUPPORT), prepend=os.pathsep)
+        patch.setenv("PYTHONPATH", os.pathsep.join(map(str, _POLICIES)), prepend=os.pathsep)
         stack.enter_context(own_ray(LOOPBACK, _port, num_cpus=_CPUS))
         _running = stack.pop_all()
 

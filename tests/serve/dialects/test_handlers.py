@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import threading
 from collections.abc import Mapping
@@ -10,8 +11,9 @@ from typing import Any, ClassVar
 
 import numpy as np
 import pytest
-from dialect_server import ALL, LIMITS, METADATA, body, call, image, libero, receive, seen, send, serving
+from dialect_server import ALL, LIMITS, METADATA, body, call, client_of, image, libero, receive, seen, send, serving
 from in_memory_keys import ChangingKeys
+from in_process_replicas import Replicas
 from served_agents import Mirror
 from starlette.testclient import TestClient, WebSocketDenialResponse
 from starlette.websockets import WebSocketDisconnect
@@ -209,6 +211,26 @@ def test_each_key_has_openvla_sessions_of_its_own_and_pays_once_a_request() -> N
         assert act("a", 7, **named) == [7, 0, 4]
         assert act("slow", 8) == [8, 0, 1]  # a reset and an act, of the one request that its rate holds
         assert sorted(engine.sessions.ids()) == ["a/robot", "b/robot"]
+
+
+@pytest.mark.parametrize("stops", [True, False])
+def test_a_session_over_http_goes_on_at_another_replica_with_its_state(stops: bool) -> None:
+    with contextlib.ExitStack() as stack:
+        replicas = stack.enter_context(contextlib.closing(Replicas([Mirror(), Mirror()])))
+        clients = [stack.enter_context(client_of(engine, {"openvla": {}})) for engine in replicas.engines]
+
+        def act(replica: int, instruction: str = "task 1") -> Any:
+            answer = clients[replica].post("/act", json=body(5, instruction), headers={"x-session-id": "robot"})
+            return openvla_codec.decode(b'{"action": %s}' % answer.content)[0]["action"][2]
+
+        assert [act(0), act(0), act(0)] == [1, 2, 3]
+        if stops:
+            replicas.engines[0].drain()
+            assert replicas.hand_over(0) == 1
+        assert [act(1), act(1)] == [4, 5]
+        assert [act(1, "task 2"), act(1, "task 2")] == [1, 2]
+        if not stops:
+            assert act(0, "task 2") == 3
 
 
 def test_a_new_key_of_a_revoked_ones_name_goes_on_with_its_sessions(

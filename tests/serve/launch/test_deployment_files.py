@@ -55,7 +55,11 @@ def test_a_file_says_where_to_listen_and_nobody_is_let_in_by_default(tmp_path: P
     assert listens_at(read_deployment(str(file))) == (EVERYWHERE, 8123)
 
 
-@pytest.mark.parametrize("file", sorted((ROOT / "deployments").glob("*.yaml")), ids=lambda file: file.stem)
+@pytest.mark.parametrize(
+    "file",
+    [*sorted((ROOT / "deployments").glob("*.yaml")), ROOT / "examples" / "raptor" / "raptor.yaml"],
+    ids=lambda file: file.stem,
+)
 def test_every_shipped_deployment_file_is_valid(file: Path, tmp_path: Path) -> None:
     """In this environment in the place of the policy's own: what is heavy comes with loading."""
     text = file.read_text()

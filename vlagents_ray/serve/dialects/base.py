@@ -34,6 +34,7 @@ The following is a complete dialect, for clients that post `{"q": [...], "task":
 from __future__ import annotations
 
 import abc
+import asyncio
 import logging
 import socket
 from collections.abc import Awaitable, Callable, Mapping, Sequence
@@ -61,7 +62,7 @@ from vlagents_ray.errors import (
 from vlagents_ray.interface import Obs
 from vlagents_ray.protocol.frames import Decoded
 from vlagents_ray.protocol.messages import DEFAULT_LIMITS, SESSION_HEADER, Budget, Limits, Op, RankName, Reply, Request
-from vlagents_ray.serve.access.api_keys import Identity, NoKey, current_caller
+from vlagents_ray.serve.access.api_keys import Caller, Identity, NoKey, current_caller
 from vlagents_ray.serve.config.dialects import DialectConfig, KeylessPortConfig, PortConfig, read_mapping
 from vlagents_ray.serve.endpoints.http_messages import (
     LONG_BYTES,
@@ -455,7 +456,7 @@ class HttpDialect(RouteDialect):
             theirs = await decoded(read, body, admission)
             obs, instruction = self.read(theirs)
             message.decoded_alike()
-            session = self._kept_session(session_id(http)) if SESSION_HEADER in http.headers else None
+            session = await self._kept_session(session_id(http)) if SESSION_HEADER in http.headers else None
             if session is None or not session.episode.begun:
                 self.mapping.warn_of_unread_cameras(theirs, self.name)
             if session is not None:
@@ -481,18 +482,35 @@ class HttpDialect(RouteDialect):
         """Answer `{}`, and make the next observation of the session in the header begin an episode."""
         name = request_id(http)
         try:
-            self._kept_session(session_id(http)).episode.end()
+            (await self._kept_session(session_id(http))).episode.end()
         except VLAgentsError as error:
             return problem_response(error, name)
         return Response(b"{}", media_type="application/json")
 
-    def _kept_session(self, name: str) -> ImplicitSession:
-        """Return the session that a client names, which exists as long as it exists in the engine."""
+    async def _kept_session(self, name: str) -> ImplicitSession:
+        """Return the session that a client names, which exists as long as it exists in an engine."""
         sessions = self.context.engine.sessions
         if len(self._kept) > 2 * len(sessions) + 16:
             self._kept = {kept: one for kept, one in self._kept.items() if kept[1] in sessions}
         sender = self.sender(name)
         known = (current_caller(), sender.session_id)
         if known not in self._kept or known[1] not in sessions:
-            self._kept[known] = self.session(sender)
+            session = self.session(sender)
+            await self._fetch(known[1])
+            if sessions.held([known[1]]):
+                session.episode.began(sessions.get(known[1]).instruction)
+            self._kept[known] = session
         return self._kept[known]
+
+    async def _fetch(self, session_id: str) -> None:
+        """Fetch a session of a client that another replica has served so far, with its state."""
+        engine, caller = self.context.engine, current_caller()
+        if engine.finder is None or session_id in engine.sessions:
+            return
+        loop, over = asyncio.get_running_loop(), asyncio.Event()
+
+        def finished() -> None:
+            loop.call_soon_threadsafe(over.set)
+
+        if engine.finder.fetch(session_id, finished, caller.name if isinstance(caller, Caller) else ""):
+            await over.wait()
