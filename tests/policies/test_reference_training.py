@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -10,6 +11,8 @@ import numpy as np
 import pytest
 import yaml
 
+from vlagents_ray import Act
+from vlagents_ray.envs.tabletop import Tabletop
 from vlagents_ray.evaluate import EvalConfig, evaluate
 from vlagents_ray.evaluate.exports.lerobot import to_lerobot
 from vlagents_ray.evaluate.results.reader import Results
@@ -38,7 +41,7 @@ def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
     plan["suites"] = [suite | {"episodes": 2} for suite in plan["suites"]]
     plan["policies"] = [{"name": "expert"}]
     evaluate(EvalConfig(**plan | {"out": folder / "runs"}), agent_factory=Scripted, in_process=True)
-    to_lerobot(Results(folder / "runs"), folder / "tabletop", successes=True)
+    to_lerobot(Results.load(folder / "runs"), folder / "tabletop", successes=True)
     return folder
 
 
@@ -66,27 +69,26 @@ def test_a_training_that_was_cut_off_and_a_second_one_end_with_the_same_weights(
     whole = train.fit(checkpoint, frames, 5, 0, tmp_path / "whole.pt")
     other = train.fit(checkpoint, frames, 5, 1, tmp_path / "other.pt")
 
-    def cut(*_: Any, **__: Any) -> None:
+    def kept_and_cut(part: Path, kept: Path) -> None:
+        part.rename(kept)
         raise KeyboardInterrupt
 
-    with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
-        patch.setattr(train.os, "replace", lambda part, kept: (Path(part).rename(kept), cut()))
-        train.fit(checkpoint, frames, 5, 0, tmp_path / "cut.pt")
+    with monkeypatch.context() as patch:
+        patch.setattr(train.os, "replace", kept_and_cut)
+        with pytest.raises(KeyboardInterrupt):
+            train.fit(checkpoint, frames, 5, 0, tmp_path / "cut.pt")
     again = train.fit(checkpoint, frames, 5, 0, tmp_path / "cut.pt")
     for name, value in whole.state_dict().items():
         assert torch.equal(again.state_dict()[name], value), name
     assert not torch.equal(other.queries, whole.queries)
 
 
-def test_what_was_trained_is_served(train: Any, data: Path, tmp_path: Path) -> None:
-    from vlagents_ray.envs.tabletop import Tabletop
+def test_what_was_trained_is_served(train: Any, data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     from vlagents_ray.policies.reference import Reference
 
+    monkeypatch.setattr(train, "BATCH", 16)
     checkpoint, frames = train.read(data, CAMERAS, tmp_path / "images")
-    monkeypatch = pytest.MonkeyPatch()
-    with monkeypatch.context() as patch:
-        patch.setattr(train, "BATCH", 32)
-        train.save(checkpoint, train.fit(checkpoint, frames, 2, 0, tmp_path / "state.pt"), tmp_path / "checkpoint")
+    train.save(checkpoint, train.fit(checkpoint, frames, 2, 0, tmp_path / "state.pt"), tmp_path / "checkpoint")
     policy = Reference.from_config({"checkpoint": str(tmp_path / "checkpoint"), "execute": 4})
     policy.initialize()
     env = Tabletop("stack", width=64, height=64, cameras=("front", "wrist"))
@@ -94,5 +96,5 @@ def test_what_was_trained_is_served(train: Any, data: Path, tmp_path: Path) -> N
     policy.reset(obs, env.instruction, seed=0)
     chunk = policy.act(obs).action
     assert chunk.shape == (4, 4)
-    assert policy.contract.action == env.contract.action.__class__(**checkpoint.embodiments["tabletop"].action)
-    env.step(policy.act(obs))
+    assert policy.contract.action == replace(env.contract.action, low=None, high=None)
+    env.step(Act(chunk[0]))

@@ -204,5 +204,7 @@ def read_values(file: BinaryIO) -> Mapping[str, np.ndarray]:
     while part := file.read(PART_BYTES):
         reader.add(part)
     if reader.received != reader.size:
-        raise MalformedMessage(f"safetensors: got {reader.received} bytes of values, the header announced {reader.size}")
+        raise MalformedMessage(
+            f"safetensors: got {reader.received} bytes of values, the header announced {reader.size}"
+        )
     return reader.values()

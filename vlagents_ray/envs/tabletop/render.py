@@ -193,7 +193,8 @@ class WristRenderer(TabletopRenderer):
         image = super().draw(world)
         u, v = self._pixel(world.x, world.y, world.z)
         rows, columns = (self._rows + v).clip(0, len(image) - 1), (self._columns + u).clip(0, image.shape[1] - 1)
-        return image[rows[:, None], columns]
+        cut: np.ndarray = image[rows[:, None], columns]
+        return cut
 
 
 FloatArray = np.ndarray  # (h, w) float32 throughout, in pixels or as a coverage in [0, 1]
