@@ -69,7 +69,7 @@ def test_of_a_console_block_only_what_was_typed_is_run(tmp_path: Path) -> None:
 
 
 def test_a_failing_python_block_fails_with_the_readmes_line_number(tmp_path: Path) -> None:
-    with pytest.raises(AssertionError, match=r"README\.py\", line 4"):
+    with pytest.raises(AssertionError, match=r"README_page\.py\", line 4"):
         run(one("# Title\n\n```python\nraise SystemError\n```\n"), tmp_path)
 
 

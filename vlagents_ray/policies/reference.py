@@ -285,6 +285,7 @@ class Reference(ModelPolicy):
 
     @property
     def state(self) -> list[str]:
+        """The parts of the robot's proprioception, in the order of its state vector."""
         return self.config.state or self.loaded().robot.state
 
     @property
