@@ -1,4 +1,4 @@
-"""An expert for LIBERO's tasks, from the simulator's state: it brings objects to places, closes drawers, turns knobs."""
+"""An expert for LIBERO's tasks, from the simulator's state: it moves objects, closes drawers and turns knobs."""
 
 from __future__ import annotations
 
@@ -12,7 +12,8 @@ from experts.osc_pose import CLOSED, OPEN, OVER_M, UP, PickExpert, PickPhase, ro
 from vlagents_ray.errors import ContractMismatch, InvalidObservation
 from vlagents_ray.interface import Obs
 
-_LIFT_M = 0.2
+_LIFT_M = 0.2  # to pass over other objects
+_DOWNWARDS_M = 0.08  # the same where the place is lower
 _CLEAR_M = 0.12  # between the object and its place, when it is carried above
 _LEAVE_M = 0.15
 _HANDLE_M = 0.121  # from the middle of a drawer to the outer side of its handle
@@ -36,7 +37,7 @@ _GRIPS = {
     "porcelain_mug": Grip((0.055, 0.0, 0.095), "x"),  # the rim on the other side of the handle
     "white_yellow_mug": Grip((-0.06, 0.0, 0.085), "x"),
     "red_coffee_mug": Grip((-0.053, 0.0, 0.115), "x"),
-    "moka_pot": Grip((0.0, 0.07, 0.03), "y", foot_m=0.067),  # handles
+    "moka_pot": Grip((0.0, 0.07, 0.03), "x", foot_m=0.067),  # handles
     "chefmate_8_frypan": Grip((0.18, 0.0, 0.042), "y"),
     "black_book": Grip((0.0, -0.012, 0.105), "x"),
     "yellow_book": Grip((0.0, 0.0, 0.095), "x"),
@@ -50,7 +51,7 @@ _MIDDLE = Grip(foot_m=0.04)
 
 _PLACING = (
     PickPhase("over", OPEN, 60),
-    PickPhase("down", OPEN, 60),
+    PickPhase("down", OPEN, 45),
     PickPhase("grasp", CLOSED, 14, waits=True),
     PickPhase("lift", CLOSED, 50),
     PickPhase("carry", CLOSED, 100),
@@ -60,13 +61,13 @@ _PLACING = (
 )
 _CLOSING = (
     PickPhase("over", CLOSED, 80),
-    PickPhase("down", CLOSED, 60),
-    PickPhase("push", CLOSED, 60),
+    PickPhase("down", CLOSED, 35),
+    PickPhase("push", CLOSED, 40),
     PickPhase("leave", CLOSED, 30),
 )
 _TURNING = (
     PickPhase("over", OPEN, 80),
-    PickPhase("down", OPEN, 60),
+    PickPhase("down", OPEN, 45),
     PickPhase("grasp", CLOSED, 12, waits=True),
     PickPhase("twist", CLOSED, 30, waits=True),
     PickPhase("release", OPEN, 8, waits=True),
@@ -88,6 +89,7 @@ class LiberoExpert(PickExpert):
         super().__init__(env_name, _PLACING)
         self._predicate: list[str] = []
         self._tries: dict[str, int] = {}
+        self._lifted_from = 0.0  # m, height of the object before it was lifted
 
     def reset(self, obs: Obs, instruction: str) -> None:
         unknown = sorted({kind for kind, *_ in self._state(obs)["goal"]} - set(_MOTIONS))
@@ -103,15 +105,14 @@ class LiberoExpert(PickExpert):
         self._aim(hand, obs)
 
     def _choose(self, obs: Obs) -> None:
-        """Select the predicate to meet next, the one tried least often."""
+        """Select the predicate to meet next: the one whose object was tried least often."""
         state = self._state(obs)
-        for predicate in state["unmet"] or state["goal"]:
-            self._tries.setdefault(" ".join(predicate), 0)
         self._predicate = min(
             state["unmet"] or state["goal"],
-            key=lambda one: (self._tries[" ".join(one)], _ORDER.index(one[0])),
+            key=lambda one: (self._tries.get(one[1], 0), _ORDER.index(one[0])),
         )
-        self._tries[" ".join(self._predicate)] += 1
+        name = self._predicate[1]
+        self._tries[name] = self._tries.get(name, 0) + 1
         self._phases = _MOTIONS[self._predicate[0]]
 
     def _hand(self, obs: Obs) -> tuple[np.ndarray, np.ndarray]:
@@ -130,25 +131,29 @@ class LiberoExpert(PickExpert):
         elif kind == "turnon":
             self._aim_at_knob(state["positions"][name], phase)
         else:
-            self._aim_at_object(hand, state, phase)
+            self._aim_at_object(hand, obs, phase)
 
-    def _aim_at_object(self, hand: np.ndarray, state: dict[str, Any], phase: str) -> None:
+    def _aim_at_object(self, hand: np.ndarray, obs: Obs, phase: str) -> None:
+        state = self._state(obs)
         _, name, place = self._predicate
         thing, there = state["positions"][name], state["positions"][place]
         grip = _GRIPS.get(name.rpartition("_")[0], _MIDDLE)
-        again = (self._tries[" ".join(self._predicate)] - 1) % 2
         if phase in ("over", "down"):
-            offset = np.array(grip.offset)
             if grip.along:
                 yaw = yaw_of(state["quaternions"][name])
-                self._turn(yaw + (math.pi / 2 if grip.along == "x" else 0.0))
-                offset = rotation(yaw * UP) @ offset
-            else:
-                self._turn(0.0)
-                offset[1] *= -1 if again else 1  # the other side of the rim
-            self._target = thing + offset + (OVER_M * UP if phase == "over" else 0.0)
+            else:  # the rim away from the cabinet, whose open drawer the hand would meet; then other sides
+                cabinets = [at[1] for other, at in state["positions"].items() if "cabinet_1" in other]
+                yaw = (math.pi if cabinets and cabinets[0] > 0 else 0.0) + math.pi / 2 * (self._tries[name] - 1)
+            self._turn(yaw + (math.pi / 2 if grip.along == "x" else 0.0))
+            self._target = thing + rotation(yaw * UP) @ np.array(grip.offset)
+            if phase == "over":
+                self._target[2] = max(self._target[2] + OVER_M, hand[2])
         elif phase == "lift":
-            self._target = hand + max(_LIFT_M, there[2] - thing[2] + grip.foot_m + _CLEAR_M) * UP
+            self._lifted_from = thing[2]
+            rise = there[2] - thing[2] + grip.foot_m + _CLEAR_M
+            self._target = hand + (_DOWNWARDS_M if rise < 0 else max(_LIFT_M, rise)) * UP
+        elif phase == "carry" and thing[2] - self._lifted_from < _DOWNWARDS_M / 2:  # lost
+            self._finished(hand, obs)
         elif phase in ("carry", "lower"):
             above = there + hand - thing  # of the hand, with the object above its place
             contained = place.endswith("contain_region")

