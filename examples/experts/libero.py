@@ -100,9 +100,10 @@ class LiberoExpert(PickExpert):
         super().reset(obs, instruction)
 
     def _finished(self, hand: np.ndarray, obs: Obs) -> None:
-        self._choose(obs)
-        self._phase, self._spent = 0, 0
-        self._aim(hand, obs)
+        if self._state(obs)["unmet"]:
+            self._choose(obs)
+            self._phase, self._spent = 0, 0
+            self._aim(hand, obs)
 
     def _choose(self, obs: Obs) -> None:
         """Select the predicate to meet next: the one whose object was tried least often."""

@@ -548,9 +548,8 @@ def _is_pro() -> bool:
 def _packaged_assets() -> Path | None:
     """Return the folder of the assets' five packages; None unless all are installed."""
     spec = importlib.util.find_spec(_PACKAGED)
-    [place, *_] = [*(spec.submodule_search_locations or ()), None] if spec else [None]
-    whole = place is not None and len(list(Path(place).glob("part_*.py"))) == _PARTS
-    return Path(place, "assets") if place and whole else None
+    places = [Path(place) for place in spec.submodule_search_locations or ()] if spec else []
+    return next((place / "assets" for place in places if len(list(place.glob("part_*.py"))) == _PARTS), None)
 
 
 def find_assets(chosen: str | None = None) -> Path:

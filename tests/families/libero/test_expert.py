@@ -53,16 +53,27 @@ def test_it_opens_the_hand_over_the_thing_first() -> None:
     action = expert.act(obs).action
     assert action.shape == (7,)
     assert action.dtype == np.float32
-    np.testing.assert_allclose(action, [0, 1, -0.96, 0, 0, 0, -1], atol=1e-6)
+    np.testing.assert_allclose(action, [0, 1, 0, 0, 0, 0, -1], atol=1e-6)
 
 
 def test_what_is_met_is_left_alone_and_what_failed_is_tried_again() -> None:
     expert = LiberoExpert("libero/libero_10/2")
     obs = observation(_IN, ["turnon", "stove_1"], unmet=[_IN])
     expert.reset(obs, "")
-    grippers = [expert.act(obs).action[6] for _ in range(800)]  # the hand never arrives: each phase takes all its steps
-    closings = np.flatnonzero(np.diff(grippers) > 0)
-    assert len(closings) == 2
+    acts = [expert.act(obs).action for _ in range(400)]  # the hand never arrives: each phase takes all its steps
+    first, second = np.flatnonzero(np.diff([act[6] for act in acts]) > 0)
+    assert acts[first][5] == 0  # the hand is turned for the second try
+    assert abs(acts[second][5]) > 0.1
+
+
+def test_it_stays_once_the_goal_is_met() -> None:
+    expert = LiberoExpert("libero/libero_object/7")
+    expert.reset(observation(_IN), "")
+    for _ in range(170):  # into the second try
+        expert.act(observation(_IN))
+    met = observation(_IN, unmet=[])
+    grippers = [expert.act(met).action[6] for _ in range(600)]  # it plays the second try to its end
+    assert set(grippers[-200:]) == {-1.0}
 
 
 @pytest.mark.parametrize("goal", [["open", "cabinet_1"], ["turnoff", "stove_1"]])
