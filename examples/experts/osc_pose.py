@@ -163,7 +163,8 @@ class RobosuiteExpert(PickExpert):
 
     def _object(self, obs: Obs) -> tuple[np.ndarray, float]:
         """Return the position of the object, (3,) m, and its angle about the vertical, rad."""
-        return self._read(obs, f"{self._handled.name}_pos", 3), yaw_of(self._read(obs, f"{self._handled.name}_quat", 4))
+        yaw = yaw_of(self._read(obs, f"{self._handled.name}_quat", 4))
+        return self._read(obs, f"{self._handled.name}_pos", 3), yaw
 
     def _read(self, obs: Obs, name: str, size: int) -> np.ndarray:
         state = obs.info.get("sim_state")
