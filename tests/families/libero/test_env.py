@@ -207,15 +207,15 @@ def test_each_reset_seeds_what_the_state_leaves_open(bowl: Libero, monkeypatch: 
 
 
 def test_images_are_upright_and_mirrored(bowl: Libero) -> None:
-    """The robot stands behind the table, above; the plate is at y = 0.2 m, to the right of who looks at the robot."""
+    """The robot stands behind the table, above; the cabinet is at y = -0.27 m, on its right."""
     obs = begin(bowl)
     image = obs.cameras["front"].astype(int)
     reddish = image[..., 0] - image[..., 2]
     assert reddish[-8:].mean() > 20  # the wooden table, below
     assert reddish[:8].mean() < 10  # the grey wall
-    white = np.argwhere(image[40:].min(axis=2) > 200)
-    assert white[:, 1].mean() < 24  # the plate, on the left
-    assert obs.info["sim_state"]["positions"]["plate_1"][1] > 0.15
+    dark = np.argwhere(image[30:].max(axis=2) < 60)
+    assert dark[:, 1].mean() > 44  # the cabinet, on the right
+    assert obs.info["sim_state"]["positions"]["wooden_cabinet_1"][1] < -0.2
     wrist = obs.cameras["wrist"].astype(int)
     assert wrist[-8:].mean() < 80 < wrist[:32].mean()  # the dark hand below, from where the fingers reach up
 
