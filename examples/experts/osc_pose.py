@@ -1,4 +1,4 @@
-"""Experts for robosuite's OSC_POSE, which pick an object from above: for LIBERO's and robosuite's tasks.
+"""Experts for robosuite's OSC_POSE, which pick an object from above: the base class, and robosuite's tasks.
 
 They read the positions of the objects from the simulator's state. An action is (7,) for one arm: 0.05 m and 0.5 rad a
 unit, gripper -1 open, 1 closed.
@@ -10,7 +10,7 @@ import math
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import numpy as np
 
@@ -18,10 +18,10 @@ from vlagents_ray.errors import ContractMismatch, InvalidObservation, MissingSta
 from vlagents_ray.interface import Act, Obs
 from vlagents_ray.registry import env_task
 
-_OPEN, _CLOSED = -1.0, 1.0
+OPEN, CLOSED = -1.0, 1.0
 _ARRIVED_M = 0.008
-_OVER_M = 0.12  # height of the hand above the grasp when approaching it
-_UP = np.array([0.0, 0.0, 1.0])
+OVER_M = 0.12  # height of the hand above the grasp when approaching it
+UP = np.array([0.0, 0.0, 1.0])
 _PER_RAD = 2.0  # units of the action: all of the remaining rotation
 _MOST_TURN = 0.3
 
@@ -59,12 +59,24 @@ class PickExpert(ABC):
         hand, orientation = self._hand(obs)
         phase = self._phases[self._phase]
         arrived = not phase.waits and float(np.linalg.norm(hand - self._target)) < _ARRIVED_M
-        if (arrived or self._spent >= phase.steps) and self._phase < len(self._phases) - 1:
-            self._phase, self._spent = self._phase + 1, 0
-            self._aim(hand, obs)
+        if arrived or self._spent >= phase.steps:
+            if self._phase < len(self._phases) - 1:
+                self._phase, self._spent = self._phase + 1, 0
+                self._aim(hand, obs)
+            else:
+                self._finished(hand, obs)
             phase = self._phases[self._phase]
         self._spent += 1
         return _towards(hand, orientation, self._target, self._turned, phase.gripper, per_m=self.per_m)
+
+    def _finished(self, hand: np.ndarray, obs: Obs) -> None:  # noqa: B027 - an expert of one object has nothing to do
+        """Begin other phases after the last one."""
+
+    def _turn(self, yaw: float) -> None:
+        """Turn the hand, by the smaller of two angles, so that its fingers close across the direction `yaw`, rad."""
+        near = (yaw + math.pi / 2) % math.pi - math.pi / 2
+        if self._first is not None:
+            self._turned = rotation(np.array([0.0, 0.0, near])) @ self._first
 
     @abstractmethod
     def _hand(self, obs: Obs) -> tuple[np.ndarray, np.ndarray]:
@@ -73,92 +85,6 @@ class PickExpert(ABC):
     @abstractmethod
     def _aim(self, hand: np.ndarray, obs: Obs) -> None:
         """Set the target of the hand in the phase that begins."""
-
-
-_SUITES = ("libero_spatial", "libero_object")
-_LIFT_M = 0.2
-_LEAVE_M = 0.15
-
-
-@dataclass(frozen=True, slots=True)
-class Grip:
-    """The grasp and release of a kind of object."""
-
-    offset: tuple[float, float, float]  # from the object's origin to the hand when it closes, m
-    release_m: float  # height of the object above its target when the hand opens
-
-
-_RIM = Grip((0.0, 0.048, 0.035), 0.02)  # bowls are wider than the hand: a finger goes inside
-_MIDDLE = Grip((0.0, 0.0, 0.0), 0.1)
-
-_PICK_AND_PLACE = (
-    PickPhase("over", _OPEN, 80),
-    PickPhase("down", _OPEN, 60),
-    PickPhase("grasp", _CLOSED, 15, waits=True),
-    PickPhase("lift", _CLOSED, 60),
-    PickPhase("carry", _CLOSED, 120),
-    PickPhase("lower", _CLOSED, 60),
-    PickPhase("release", _OPEN, 12, waits=True),
-    PickPhase("leave", _OPEN, 25),
-)
-
-
-class LiberoExpert(PickExpert):
-    """Grasps the object of the goal from above, and places it at the goal's target, in two of LIBERO's suites.
-
-    The hand keeps its initial orientation. Bowls in or on the cabinet (libero_spatial/4 and /9) are then out of reach:
-    there it acts, but fails.
-    """
-
-    def __init__(self, env_name: str) -> None:
-        suite = (env_task(env_name) or _SUITES[0]).partition("/")[0]
-        if not suite.startswith(_SUITES):  # those that vary them included
-            raise ContractMismatch(f"no scripted expert for env {env_name!r}: in LIBERO there are those for {_SUITES}")
-        super().__init__(env_name, _PICK_AND_PLACE)
-
-    def reset(self, obs: Obs, instruction: str) -> None:
-        self._goal(obs)
-        super().reset(obs, instruction)
-
-    def _hand(self, obs: Obs) -> tuple[np.ndarray, np.ndarray]:
-        pose = obs.state.get("xyz_axis_angle")
-        if pose is None or pose.shape != (6,):
-            raise InvalidObservation("state 'xyz_axis_angle': want (6,), m and rad, as LIBERO's env gives it")
-        return pose[:3].astype(np.float64), _matrix(pose[3:].astype(np.float64))
-
-    def _aim(self, hand: np.ndarray, obs: Obs) -> None:
-        name, place, positions = self._goal(obs)
-        grip = _RIM if "bowl" in name else _MIDDLE
-        thing = positions[name]
-        grasp = thing + np.array(grip.offset)
-        above = positions[place] + hand - thing  # of the hand, with the object above its target
-        targets: dict[str, np.ndarray] = {
-            "over": grasp + _OVER_M * _UP,
-            "down": grasp,
-            "lift": hand + _LIFT_M * _UP,
-            "carry": np.array([above[0], above[1], hand[2]]),
-            "lower": above + grip.release_m * _UP,
-            "leave": hand + _LEAVE_M * _UP,
-        }
-        # in other phases only the fingers move
-        self._target = targets.get(self._phases[self._phase].name, self._target)
-
-    def _goal(self, obs: Obs) -> tuple[str, str, dict[str, np.ndarray]]:
-        """Return the names of the object and of its place, and the positions of objects, (3,) m."""
-        state = obs.info.get("sim_state")
-        if not isinstance(state, dict) or not {"goal", "positions"} <= set(state):
-            got: Any = sorted(state) if isinstance(state, dict) else type(state).__name__
-            raise InvalidObservation(
-                f"info['sim_state']: got {got}, want the goal and the positions, as the env {self._name} gives "
-                f"them; this expert cannot act on images"
-            )
-        goal, positions = state["goal"], state["positions"]
-        if len(goal) != 1 or len(goal[0]) != 3 or goal[0][0] not in ("on", "in"):
-            raise ContractMismatch(f"{self._name}: the expert brings one thing to one place, the goal is {goal}")
-        _, name, place = goal[0]
-        if missing := {name, place} - set(positions):
-            raise InvalidObservation(f"info['sim_state']: no position of {sorted(missing)}, got {sorted(positions)}")
-        return name, place, positions
 
 
 @dataclass(frozen=True, slots=True)
@@ -178,16 +104,16 @@ _HANDLED = {
     "NutAssemblySquare": Handling("SquareNut", handle_m=0.054, aligned=True, release_m=0.02),
 }
 _PICK = (
-    PickPhase("over", _OPEN, 80),
-    PickPhase("down", _OPEN, 60),
-    PickPhase("grasp", _CLOSED, 12, waits=True),
-    PickPhase("lift", _CLOSED, 60),
+    PickPhase("over", OPEN, 80),
+    PickPhase("down", OPEN, 60),
+    PickPhase("grasp", CLOSED, 12, waits=True),
+    PickPhase("lift", CLOSED, 60),
 )
 _PLACE = (
-    PickPhase("carry", _CLOSED, 100),
-    PickPhase("lower", _CLOSED, 50),
-    PickPhase("release", _OPEN, 8, waits=True),
-    PickPhase("leave", _OPEN, 25),
+    PickPhase("carry", CLOSED, 100),
+    PickPhase("lower", CLOSED, 50),
+    PickPhase("release", OPEN, 8, waits=True),
+    PickPhase("leave", OPEN, 25),
 )
 
 
@@ -213,38 +139,31 @@ class RobosuiteExpert(PickExpert):
         sine = math.sqrt(x * x + y * y + z * z)
         angle = 2.0 * math.atan2(sine, w)
         axis = np.array([x, y, z]) / sine if sine else np.zeros(3)
-        return obs.state["robot0_eef_pos"].astype(np.float64), _matrix(angle * axis)
+        return obs.state["robot0_eef_pos"].astype(np.float64), rotation(angle * axis)
 
     def _aim(self, hand: np.ndarray, obs: Obs) -> None:
         handled, phase = self._handled, self._phases[self._phase].name
         thing, yaw = self._object(obs)
         grasp = thing + handled.handle_m * np.array([math.cos(yaw), math.sin(yaw), 0.0])
         if phase == "over":
-            self._target = grasp + _OVER_M * _UP
+            self._target = grasp + OVER_M * UP
             if handled.aligned:
                 self._turn(yaw)
         elif phase == "down":
             self._target = grasp
         elif phase in ("lift", "leave"):
-            self._target = hand + handled.lift_m * _UP
+            self._target = hand + handled.lift_m * UP
         elif phase in ("carry", "lower"):
             right = round(yaw / (math.pi / 2)) * math.pi / 2 if handled.aligned else yaw
-            held = _matrix(np.array([0.0, 0.0, right - yaw])) @ (hand - thing)
+            held = rotation(np.array([0.0, 0.0, right - yaw])) @ (hand - thing)
             height = handled.lift_m if phase == "carry" else handled.release_m or 0.0
-            self._target = self._read(obs, "target_pos", 3) + held + height * _UP
+            self._target = self._read(obs, "target_pos", 3) + held + height * UP
             if handled.aligned and phase == "carry":
                 self._turn(right)
 
-    def _turn(self, yaw: float) -> None:
-        """Turn the hand, by the smaller of two angles, so that its fingers close across the direction `yaw`, rad."""
-        near = (yaw + math.pi / 2) % math.pi - math.pi / 2
-        if self._first is not None:
-            self._turned = _matrix(np.array([0.0, 0.0, near])) @ self._first
-
     def _object(self, obs: Obs) -> tuple[np.ndarray, float]:
         """Return the position of the object, (3,) m, and its angle about the vertical, rad."""
-        x, y, z, w = self._read(obs, f"{self._handled.name}_quat", 4)
-        yaw = math.atan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z))
+        yaw = yaw_of(self._read(obs, f"{self._handled.name}_quat", 4))
         return self._read(obs, f"{self._handled.name}_pos", 3), yaw
 
     def _read(self, obs: Obs, name: str, size: int) -> np.ndarray:
@@ -273,7 +192,13 @@ def _towards(
     return Act(np.concatenate([move, turn, [gripper]]).astype(np.float32))
 
 
-def _matrix(rotation_vector: np.ndarray) -> np.ndarray:
+def yaw_of(quaternion: np.ndarray) -> float:
+    """Return the angle of a unit quaternion xyzw about the vertical, rad."""
+    x, y, z, w = (float(part) for part in quaternion)
+    return math.atan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z))
+
+
+def rotation(rotation_vector: np.ndarray) -> np.ndarray:
     """Convert a rotation vector (3,) rad to a matrix (3, 3) by Rodrigues' formula."""
     angle = float(np.linalg.norm(rotation_vector))
     if angle == 0.0:

@@ -65,7 +65,7 @@ LOCKS = {  # of the stages that install
 INSTALL = (FOLDER / "install.sh").read_text()
 SIMULATORS = re.findall(r'^(\w+) = \["vlagents-ray\[sim\]"', (ROOT / "pyproject.toml").read_text(), re.MULTILINE)
 FAMILIES = [file.stem for file in resolved.families()]
-MODELS = set(FAMILIES) - set(SIMULATORS) - {"rcs", "robosuite"}
+MODELS = set(FAMILIES) - set(SIMULATORS) - {"libero_pro", "rcs", "robosuite"}
 
 
 def of(word: str, stage: str | None = None) -> list[str]:

