@@ -9,6 +9,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 import pytest
+from tables import page_of
 
 from vlagents_ray.contract import ActionSpec, Contract
 from vlagents_ray.envs.simulator import BenchmarkProtocol, SimulatorEnv
@@ -54,7 +55,7 @@ def test_what_a_protocol_does_not_settle_cannot_deviate_from_it() -> None:
 
 @pytest.mark.parametrize("suite", sorted(set(ENVS) - ANY_PROTOCOL))
 def test_the_page_of_a_benchmark_states_its_protocol(suite: str) -> None:
-    page = (PAGES / f"{'rcs' if suite == 'duobench' else suite}.md").read_text()
+    page = (PAGES / f"{page_of(suite, ENVS[suite])}.md").read_text()
     section = re.search(r"^## Protocol\n(.*?)(?=^## |\Z)", page, re.DOTALL | re.MULTILINE)
     assert section is not None
     for stated in ("step", "success"):

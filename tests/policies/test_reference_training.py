@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib.util
 import sys
 from dataclasses import replace
 from pathlib import Path
@@ -27,10 +28,13 @@ CAMERAS = {"tabletop": {"scene": "front", "wrist": "wrist"}}
 
 @pytest.fixture(scope="module")
 def train() -> Any:
-    with pytest.MonkeyPatch.context() as patch:
-        patch.syspath_prepend(ROOT / "reference")
-        yield __import__("train")
-        sys.modules.pop("train")
+    """The program, by a name that no other program of a test has."""
+    spec = importlib.util.spec_from_file_location("reference_training", ROOT / "reference/train.py")
+    assert spec is not None
+    assert spec.loader is not None
+    module = sys.modules["reference_training"] = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
 
 
 @pytest.fixture(scope="module")

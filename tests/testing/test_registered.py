@@ -13,8 +13,8 @@ from vlagents_ray.testing import check_agent, check_env
 
 # Registered names whose own test modules run the suites, because they need a simulator or a setting.
 CHECKED_ELSEWHERE = {
-    "libero", "maniskill", "metaworld", "rcs", "duobench", "robosuite", "robocasa", "calvin", "simpler", "aloha",
-    "upstream",
+    "libero", "libero_pro", "maniskill", "metaworld", "rcs", "duobench", "robosuite", "robocasa", "calvin", "simpler",
+    "aloha", "upstream",
 }  # fmt: skip
 VARIANTS = {  # of envs that are not tried by their own name alone
     "gymnasium": ["gymnasium/Pendulum-v1", "gymnasium/gym_pusht/PushT-v0"],
