@@ -14,11 +14,12 @@ import time
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import numpy as np
 import torch
 import typer
+from torch.nn.functional import smooth_l1_loss
 
 from vlagents_ray.open_loop.recorded import Names, RecordedDataset
 from vlagents_ray.policies.base.model_inputs import resize_with_pad, state_vector
@@ -40,6 +41,7 @@ BATCH = 256  # frames
 DRAWS = 4  # times that a frame's context is used in a step, each with noise of its own: they cost little
 RATE, DECAY, CLIP = 1e-3, 0.01, 1.0  # of AdamW, and the largest norm of a gradient
 WARM_UP = 200  # steps, after which the rate falls as a cosine
+OBJECTS = 1.0  # weight of the error of the places of objects, which teaches early what words mean in images
 AVERAGE = 0.999  # of the weights, per step; these are what is saved
 KEEP_EVERY = 500  # steps between two kept states
 SHOWN_EVERY = 100  # steps between two lines of the log
@@ -47,59 +49,68 @@ SHOWN_EVERY = 100  # steps between two lines of the log
 
 @dataclass(frozen=True)
 class Frames:
-    """All frames of all datasets, in the order of robots and episodes."""
+    """The frames of all datasets, in the order of robots and episodes; M of them are trained with."""
 
-    images: np.ndarray  # (N, cameras, S, S, 3) uint8
+    images: np.ndarray  # (M, cameras, S, S, 3) uint8
+    place: torch.Tensor  # (M,) int64, of each among all N
     state: torch.Tensor  # (N, S) in the network's units
+    objects: torch.Tensor  # (N, O) places of objects, of mean 0 and variance 1; NaN where a robot's dataset has none
     action: torch.Tensor  # (N, D)
     tokens: torch.Tensor  # (N, L)
     end: torch.Tensor  # (N,) int64, the first frame after the episode's
 
 
-def read(data: Path, cameras: dict[str, dict[str, str]], kept: Path) -> tuple[Checkpoint, Frames]:
+def read(data: Path, cameras: dict[str, dict[str, str]], kept: Path, every: int = 1) -> tuple[Checkpoint, Frames]:
     """Read the dataset of each robot in a folder.
 
     Args:
         data: The folder, with a dataset for each robot.
         cameras: Of the network -> of the robot, by robot.
         kept: A file for the decoded images, which may be larger than the memory.
+        every: One frame of so many of an episode is trained with: its neighbours are nearly the same.
 
     Returns:
         What the checkpoint states, and the frames.
     """
     sizes = NetworkSizes(words=1)
-    texts, states, actions, ends, robots, total = list[str](), list[Any](), list[Any](), list[int](), {}, 0
+    texts, ends, places = list[str](), list[int](), list[int]()
+    states, objects, actions = list[np.ndarray](), list[np.ndarray](), list[np.ndarray]()
+    robots: dict[str, Embodiment] = {}
     with kept.open("wb") as file:
         for robot, names in cameras.items():
-            dataset = RecordedDataset(data / robot)
+            dataset, own, around = RecordedDataset(data / robot), list[np.ndarray](), list[np.ndarray]()
             contract = dataset.contract
             if contract is None:
                 raise typer.BadParameter(f"{data / robot}: was not exported by this project: its info has no contract")
-            parts, own = list(contract.state), list[np.ndarray]()
             for play in dataset.plays():
                 [episode] = play.parts
-                begun = len(own)
+                begun, total = len(texts), len(texts) + episode.length
                 for step in dataset.steps(episode, Names(), None):
-                    seen = [resize_with_pad(step.obs.cameras[names[name]], sizes.side, sizes.side) for name in CAMERAS]
-                    file.write(np.stack(seen).tobytes())
-                    own.append(state_vector(step.obs, parts))
+                    if step.frame % every == 0:
+                        seen = (step.obs.cameras[names[name]] for name in CAMERAS)
+                        file.write(np.stack([resize_with_pad(one, sizes.side, sizes.side) for one in seen]).tobytes())
+                        places.append(begun + step.frame)
+                    own.append(state_vector(step.obs, contract.state))
+                    around.append(state_vector(step.obs, contract.environment))
                     actions.append(step.expected[0])
-                ends += [total + len(own)] * (len(own) - begun)
-                texts += [episode.instruction] * (len(own) - begun)
-            found = np.stack(own)
-            action = contract.contract.to_json()["action"]
+                ends += [total] * episode.length
+                texts += [episode.instruction] * episode.length
+            found, things = np.stack(own), np.stack(around)
             robots[robot] = Embodiment(
-                cameras=names, state=parts, state_mean=found.mean(0).tolist(), state_std=found.std(0).tolist(),
-                action=action,
+                cameras=names, state=list(contract.state), state_mean=found.mean(0).tolist(),
+                state_std=found.std(0).tolist(), action=contract.contract.to_json()["action"],
             )  # fmt: skip
             states.append(normalised(robots[robot], found, sizes.state))
-            total += len(own)
+            objects.append((things - things.mean(0)) / np.maximum(things.std(0), 1e-2))
     words = sorted({word for text in set(texts) for word in words_of(text)})
     checkpoint = Checkpoint(sizes=sizes.model_copy(update={"words": len(words)}), words=words, embodiments=robots)
-    images = np.memmap(kept, np.uint8, "r", shape=(total, len(CAMERAS), sizes.side, sizes.side, 3))
+    images = np.memmap(kept, np.uint8, "r", shape=(len(places), len(CAMERAS), sizes.side, sizes.side, 3))
     known = {text: checkpoint.tokens(text) for text in set(texts)}
+    widest = max(one.shape[1] for one in objects)
+    filled = [np.pad(one, ((0, 0), (0, widest - one.shape[1])), constant_values=np.nan) for one in objects]
     return checkpoint, Frames(
-        images, torch.from_numpy(np.concatenate(states)), torch.from_numpy(np.stack(actions)),
+        images, torch.tensor(places), torch.from_numpy(np.concatenate(states)),
+        torch.from_numpy(np.concatenate(filled).astype(np.float32)), torch.from_numpy(np.stack(actions)),
         torch.from_numpy(np.stack([known[text] for text in texts])), torch.tensor(ends),
     )  # fmt: skip
 
@@ -111,12 +122,21 @@ def batches(frames: int, seed: int) -> Iterator[np.ndarray]:
         yield from (np.sort(order[at : at + BATCH]) for at in range(0, max(frames - BATCH, 0) + 1, BATCH))
 
 
-def loss_of(network: ReferenceNetwork, frames: Frames, batch: np.ndarray, draws: torch.Generator) -> torch.Tensor:
-    """Return the mean squared error of the flow's velocity, over the actions of a batch's episodes.
+def loss_of(
+    network: ReferenceNetwork, guess: torch.nn.Module, frames: Frames, batch: np.ndarray, draws: torch.Generator
+) -> tuple[torch.Tensor, torch.Tensor]:
+    """Return the mean squared error of the flow's velocity over a batch, and the error of the places of objects.
 
     Times are drawn as for π0 (arXiv 2410.24164), more of them near the noise.
+
+    Args:
+        network: The network.
+        guess: Guesses the places of objects (B, O) from a context; of the training alone.
+        frames: All frames.
+        batch: Those of the batch, (B,) among those that are trained with.
+        draws: The generator of noise and times.
     """
-    index, horizon = torch.from_numpy(batch), network.sizes.horizon
+    index, horizon = frames.place[batch], network.sizes.horizon
     rows = index[:, None] + torch.arange(horizon)
     there = (rows < frames.end[index][:, None]).float()[..., None].repeat(DRAWS, 1, 1)
     actions = frames.action[rows.clamp(max=len(frames.action) - 1)].repeat(DRAWS, 1, 1)
@@ -125,46 +145,53 @@ def loss_of(network: ReferenceNetwork, frames: Frames, batch: np.ndarray, draws:
     noisy = times[:, None, None] * noise + (1 - times)[:, None, None] * actions
     images = pixels(torch.from_numpy(frames.images[batch])).unbind(1)
     with torch.autocast("cpu", torch.bfloat16):
-        context = network.encode(frames.tokens[index], frames.state[index], *images).repeat(DRAWS, 1)
-        velocity = network.velocity(context, noisy, times)
-    return ((velocity.float() - (noise - actions)) ** 2 * there).sum() / there.sum() / actions.shape[-1]
+        context = network.encode(frames.tokens[index], frames.state[index], *images)
+        velocity, guessed = network.velocity(context.repeat(DRAWS, 1), noisy, times), guess(context)
+    objects, flow = frames.objects[index], (velocity.float() - (noise - actions)) ** 2 * there
+    known = ~objects.isnan()
+    off = smooth_l1_loss(guessed.float()[known], objects[known]) if known.any() else torch.zeros(())
+    return flow.sum() / there.sum() / actions.shape[-1], off
 
 
 def fit(checkpoint: Checkpoint, frames: Frames, steps: int, seed: int, kept: Path) -> ReferenceNetwork:
     """Return the network after so many steps, from the state in the file `kept` if there is one."""
     torch.manual_seed(seed)
     network = ReferenceNetwork(checkpoint.sizes)
+    guess = torch.nn.Linear(2 * checkpoint.sizes.head, frames.objects.shape[1])
     average = copy.deepcopy(network)
-    optimizer = torch.optim.AdamW(network.parameters(), lr=RATE, weight_decay=DECAY, betas=(0.9, 0.99))
+    trained = [*network.parameters(), *guess.parameters()]
+    optimizer = torch.optim.AdamW(trained, lr=RATE, weight_decay=DECAY, betas=(0.9, 0.99))
     first = 0
     if kept.is_file():
         state = torch.load(kept, weights_only=True)
         network.load_state_dict(state["network"])
+        guess.load_state_dict(state["guess"])
         average.load_state_dict(state["average"])
         optimizer.load_state_dict(state["optimizer"])
         first = state["step"]
         typer.echo(f"continues after step {first}")
-    begun, losses = time.monotonic(), list[float]()
+    begun, losses = time.monotonic(), list[tuple[float, float]]()
     own, mean = list(network.parameters()), list(average.parameters())
-    for step, batch in zip(range(steps), batches(len(frames.state), seed), strict=False):
+    for step, batch in zip(range(steps), batches(len(frames.place), seed), strict=False):
         if step < first:
             continue
         for group in optimizer.param_groups:
             group["lr"] = RATE * min(1.0, (step + 1) / WARM_UP) * 0.5 * (1 + math.cos(math.pi * step / steps))
-        loss = loss_of(network, frames, batch, torch.Generator().manual_seed(seed * 2**32 + step))
+        flow, off = loss_of(network, guess, frames, batch, torch.Generator().manual_seed(seed * 2**32 + step))
         optimizer.zero_grad()
-        loss.backward()
-        torch.nn.utils.clip_grad_norm_(own, CLIP)
+        (flow + OBJECTS * off).backward()
+        torch.nn.utils.clip_grad_norm_(trained, CLIP)
         optimizer.step()
         with torch.no_grad():
             torch._foreach_lerp_(mean, own, 1 - min(AVERAGE, (1 + step) / (10 + step)))
-        losses.append(loss.item())
+        losses.append((flow.item(), off.item()))
         done = step + 1
         if done % SHOWN_EVERY == 0 or done == steps:
             rate = (done - first) * BATCH / (time.monotonic() - begun)
-            typer.echo(f"step {done} of {steps}: loss {np.mean(losses[-SHOWN_EVERY:]):.4f}, {rate:.0f} frames/s")
+            loss, error = np.mean(losses[-SHOWN_EVERY:], axis=0)
+            typer.echo(f"step {done} of {steps}: loss {loss:.4f}, objects {error:.4f}, {rate:.0f} frames/s")
         if done % KEEP_EVERY == 0 and done < steps:
-            state = {"network": network.state_dict(), "average": average.state_dict(),
+            state = {"network": network.state_dict(), "guess": guess.state_dict(), "average": average.state_dict(),
                      "optimizer": optimizer.state_dict(), "step": done}  # fmt: skip
             torch.save(state, kept.with_suffix(".part"))
             os.replace(kept.with_suffix(".part"), kept)
@@ -185,6 +212,7 @@ def main(
     cameras: Annotated[list[str], typer.Option(help="ROBOT=SCENE,WRIST: the robot's names of the cameras.")],
     steps: Annotated[int, typer.Option(min=1, help=f"Of {BATCH} frames each.")] = 12000,
     seed: Annotated[int, typer.Option(min=0)] = 0,
+    every: Annotated[int, typer.Option(min=1, help="Of so many frames of an episode, one is trained with.")] = 1,
     threads: Annotated[int, typer.Option(min=1, help="Others round differently.")] = 2,
     work: Annotated[Path, typer.Option(help="Folder for decoded images and the state of the training.")] = Path(
         "runs/reference/train"
@@ -196,8 +224,10 @@ def main(
     work.mkdir(parents=True, exist_ok=True)
     named = {robot: dict(zip(CAMERAS, names.split(","), strict=True)) for robot, _, names in
              (one.partition("=") for one in cameras)}  # fmt: skip
-    checkpoint, frames = read(data, named, work / "images.bin")
-    typer.echo(f"{len(frames.state)} frames of {len(named)} robots, {len(checkpoint.words)} words")
+    checkpoint, frames = read(data, named, work / "images.bin", every)
+    typer.echo(
+        f"{len(frames.place)} of {len(frames.state)} frames of {len(named)} robots, {len(checkpoint.words)} words"
+    )
     save(checkpoint, fit(checkpoint, frames, steps, seed, work / "state.pt"), out)
 
 

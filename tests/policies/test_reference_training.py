@@ -45,7 +45,8 @@ def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
     plan["suites"] = [suite | {"episodes": 2} for suite in plan["suites"]]
     plan["policies"] = [{"name": "expert"}]
     evaluate(EvalConfig(**plan | {"out": folder / "runs"}), agent_factory=Scripted, in_process=True)
-    to_lerobot(Results.load(folder / "runs"), folder / "tabletop", successes=True)
+    objects = ["puck", "target"]
+    to_lerobot(Results.load(folder / "runs"), folder / "tabletop", successes=True, environment_state=objects)
     return folder
 
 
@@ -55,6 +56,10 @@ def test_frames_are_those_that_were_recorded(train: Any, data: Path, tmp_path: P
     robot = checkpoint.embodiments["tabletop"]
     assert (robot.state, robot.action["gripper_open"]) == (["xyzrpy", "gripper"], 1.0)
     assert frames.images.shape == (len(frames.state), 2, 64, 64, 3)
+    assert frames.objects.shape == (len(frames.state), 6)
+    _, some = train.read(data, CAMERAS, tmp_path / "some", every=3)
+    assert len(some.place) == len(some.images) < len(frames.place) / 2
+    assert np.array_equal(some.images, frames.images[some.place])
     assert frames.images[0, 0].std() > 10 < frames.images[0, 1].std()
     assert frames.action.abs().max() <= 1
     ends = frames.end.unique()
