@@ -23,18 +23,18 @@ from torch.nn.functional import smooth_l1_loss
 
 from vlagents_ray.open_loop.recorded import Names, RecordedDataset
 from vlagents_ray.policies.base.model_inputs import resize_with_pad, state_vector
-from vlagents_ray.policies.reference import (
+from vlagents_ray.policies.reference.checkpoint import (
     CAMERAS,
     CONFIG,
     WEIGHTS,
     Checkpoint,
     Embodiment,
     NetworkSizes,
-    ReferenceNetwork,
     normalised,
     pixels,
     words_of,
 )
+from vlagents_ray.policies.reference.network import ReferenceNetwork
 from vlagents_ray.weights.safetensors import write_values
 
 BATCH = 256  # frames

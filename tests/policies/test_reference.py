@@ -20,23 +20,25 @@ from vlagents_ray.errors import ConfigError, InvalidObservation, MissingCamera
 from vlagents_ray.interface import BEHAVIOUR, DELAY, DISTRIBUTION, LEFTOVER, SAMPLES, WANT
 from vlagents_ray.policies.adapters import CONFIG as ADAPTER_CONFIG
 from vlagents_ray.policies.adapters import WEIGHTS as ADAPTER_WEIGHTS
+from vlagents_ray.policies.base import Row
 from vlagents_ray.policies.flow import logprob_of_chain
+from vlagents_ray.policies.reference import Reference, policy
+from vlagents_ray.policies.reference.checkpoint import CONFIG, WEIGHTS, Checkpoint, Embodiment, NetworkSizes, words_of
 from vlagents_ray.testing import check_agent
 from vlagents_ray.weights.safetensors import write_values
 
 torch = pytest.importorskip("torch")
 pytestmark = pytest.mark.torch
 
-reference = pytest.importorskip("vlagents_ray.policies.reference")
-Reference = reference.Reference
+network = pytest.importorskip("vlagents_ray.policies.reference.network")
 
 WORDS = ("put the red puck on the blue pad", "lift the blue puck", "open the drawer")
 ROBOTS = {
-    "tabletop": reference.Embodiment(
+    "tabletop": Embodiment(
         cameras={"scene": "front", "wrist": "wrist"}, state=["xyzrpy", "gripper"], state_mean=[0.0] * 7,
         state_std=[0.1] * 6 + [0.0], action={"dim": 4, "space": "ee_position", "delta": True},
     ),
-    "sawyer": reference.Embodiment(
+    "sawyer": Embodiment(
         cameras={"scene": "corner2", "wrist": "gripperPOV"}, state=["xyz", "gripper"], state_mean=[0.0] * 4,
         state_std=[0.1] * 4, action={"dim": 4, "space": "ee_position", "delta": True}, execute=3,
     ),
@@ -50,15 +52,15 @@ SUMMED = 2e-3  # how far a sum of 5 log-probabilities may be off, in float32
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     path: Path = tmp_path_factory.mktemp("reference")
-    words = sorted({word for text in WORDS for word in reference.words_of(text)})
-    sizes = reference.NetworkSizes(words=len(words), width=32, head=32, queries=4, blocks=1, token_width=16)
+    words = sorted({word for text in WORDS for word in words_of(text)})
+    sizes = NetworkSizes(words=len(words), width=32, head=32, queries=4, blocks=1, token_width=16)
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(0)
-        network = reference.ReferenceNetwork(sizes)
-    checkpoint = reference.Checkpoint(sizes=sizes, words=words, embodiments=ROBOTS)
-    (path / reference.CONFIG).write_text(checkpoint.model_dump_json())
-    with (path / reference.WEIGHTS).open("wb") as file:
-        write_values(file, {name: value.numpy() for name, value in network.state_dict().items()})
+        values = network.ReferenceNetwork(sizes).state_dict()
+    checkpoint = Checkpoint(sizes=sizes, words=words, embodiments=ROBOTS)
+    (path / CONFIG).write_text(checkpoint.model_dump_json())
+    with (path / WEIGHTS).open("wb") as file:
+        write_values(file, {name: value.numpy() for name, value in values.items()})
     return path
 
 
@@ -142,18 +144,18 @@ def test_what_it_was_not_trained_with_is_refused(loaded: Any) -> None:
 
 
 def test_a_checkpoint_that_is_damaged_is_refused(folder: Path, tmp_path: Path) -> None:
-    for name in (reference.CONFIG, reference.WEIGHTS):
+    for name in (CONFIG, WEIGHTS):
         (tmp_path / name).write_bytes((folder / name).read_bytes())
-    whole = (folder / reference.WEIGHTS).read_bytes()
-    (tmp_path / reference.WEIGHTS).write_bytes(whole[:-5])
+    whole = (folder / WEIGHTS).read_bytes()
+    (tmp_path / WEIGHTS).write_bytes(whole[:-5])
     with pytest.raises(ConfigError, match=r"model.safetensors"):
         made(tmp_path)
-    (tmp_path / reference.WEIGHTS).write_bytes(whole)
-    stated = json.loads((folder / reference.CONFIG).read_text())
-    (tmp_path / reference.CONFIG).write_text(json.dumps(stated | {"sizes": {**stated["sizes"], "head": 64}}))
+    (tmp_path / WEIGHTS).write_bytes(whole)
+    stated = json.loads((folder / CONFIG).read_text())
+    (tmp_path / CONFIG).write_text(json.dumps(stated | {"sizes": {**stated["sizes"], "head": 64}}))
     with pytest.raises(ConfigError, match=r"model.safetensors: cannot be read: .*size mismatch"):
         made(tmp_path)
-    (tmp_path / reference.CONFIG).write_text("{}")
+    (tmp_path / CONFIG).write_text("{}")
     with pytest.raises(ConfigError, match="is no checkpoint of the reference policy"):
         made(tmp_path)
 
@@ -171,15 +173,15 @@ def test_the_log_probability_is_the_one_that_a_learner_computes(learnt: Any) -> 
     rows = []
     for session, obs in zip(sessions, views, strict=True):
         frame = session.perceive(obs)
-        rows.append(reference.Row((frame,), WORDS[0], np.random.default_rng(0)))
+        rows.append(Row((frame,), WORDS[0], np.random.default_rng(0)))
     inputs = {name: value.clone() for name, value in learnt._inputs(rows).items()}
     acts = learnt.act_batch(views, sessions)
     said = [act.info[BEHAVIOUR] for act in acts]
     chains = torch.from_numpy(np.stack([one["replay"]["chain"] for one in said]))
     with torch.no_grad():
-        velocity = reference.flow_velocity(learnt.model.network, inputs)
+        velocity = network.flow_velocity(learnt.model.network, inputs)
         again = logprob_of_chain(velocity, chains, LEVEL)
-        first = reference.flow_velocity(learnt.model.network, {name: value[:1] for name, value in inputs.items()})
+        first = network.flow_velocity(learnt.model.network, {name: value[:1] for name, value in inputs.items()})
         total = logprob_of_steps(first, said[0]["replay"]["chain"], LEVEL)
     np.testing.assert_allclose(again, np.stack([one["logprob"] for one in said]), atol=SUMMED)
     np.testing.assert_allclose(said[0]["logprob"], total, atol=SUMMED)
@@ -187,7 +189,7 @@ def test_the_log_probability_is_the_one_that_a_learner_computes(learnt: Any) -> 
 
 
 def test_the_samples_of_an_observation_are_of_one_reading_of_it(learnt: Any) -> None:
-    check_shared_readings(learnt, [seen(0, **{SAMPLES: 4, WANT: ALL}), seen(1)], begun, reference, BATCHED)
+    check_shared_readings(learnt, [seen(0, **{SAMPLES: 4, WANT: ALL}), seen(1)], begun, policy, BATCHED)
 
 
 def test_compiled_in_bfloat16_and_with_pushed_weights_it_stays_itself(folder: Path, loaded: Any) -> None:

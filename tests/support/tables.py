@@ -1,18 +1,23 @@
 """The tables of README and docs/ about policies and environments: `python tests/support/tables.py` writes them.
 
-They are made from the registry, and lie between `<!-- table: NAME -->` and `<!-- /table -->`. So are the pages in the
-navigation of mkdocs.yml.
+They are made from the registry and from what tests have verified, and lie between `<!-- table: NAME -->` and
+`<!-- /table -->`. So are the pages in the navigation of mkdocs.yml.
 """
 
 from __future__ import annotations
 
+import json
 import re
 from collections.abc import Iterable, Iterator
 from pathlib import Path
 
+from verified import marked, notes
+
+from vlagents_ray.evaluate.results.statistics import wilson
 from vlagents_ray.registry import ENVS, POLICIES, Adapter
 
 ROOT = Path(__file__).parents[2]
+RATES = json.loads((ROOT / "tests/rates.json").read_text())  # which the tests that it names find again
 PLUGINS = ("arro",)  # pages among those of the policies, of packages in plugins/
 
 
@@ -30,12 +35,30 @@ def _code(words: Iterable[str]) -> str:
     return ", ".join(f"`{word}`" for word in words)
 
 
+def page_of(name: str, one: Adapter) -> str:
+    """Return the name of an adapter's page; empty if it has none."""
+    return name if one.page is None else one.page.partition("#")[0]
+
+
+def verified(name: str, family: str = "") -> str:
+    """Return what tests have verified of a policy; `family` is its folder in tests/families."""
+    rate = RATES.get(name, {})
+    if "successes" in rate:
+        low, high = wilson(rate["successes"], rate["episodes"])
+        share = rate["successes"] / rate["episodes"]
+        return f"✓ {100 * share:.0f} % [{100 * low:.0f}, {100 * high:.0f}] of {rate['episodes']}"
+    parity = {test for test, what in marked(family) if what == "parity"} if family else set()
+    cases = [one["tests"].get(test, {}).get("passed", 0) for one in notes(family) for test in parity] if parity else []
+    return "◇" if any(cases) or rate.get("equal") else "○"
+
+
 def policies(folder: str = "") -> Iterator[str]:
     """Yield the rows of the policies; `folder` leads to docs/policies."""
-    yield from ("| policy | models | source |", "|---|---|---|")
+    yield from ("| policy | models | source | verified |", "|---|---|---|---|")
     for name, one in _listed(POLICIES):
         source = f"a checkout, {_code(one.checkouts)}" if one.checkouts else "PyPI"
-        yield f"| {_link(name, f'`{name}`', one, folder)} | {one.about} | {one.wants or source} |"
+        said = verified(name, page_of(name, one))
+        yield f"| {_link(name, f'`{name}`', one, folder)} | {one.about} | {one.wants or source} | {said} |"
 
 
 def environments(folder: str = "") -> Iterator[str]:
@@ -48,12 +71,14 @@ def environments(folder: str = "") -> Iterator[str]:
         yield f"| {_link(name, f'`{name}{one.tasks}`', one, folder)} | {one.about} | {wants}".rstrip() + " |"
 
 
-_OWN_POLICY = "a class with `initialize`, `reset` and `act` | `vlagents-ray new policy NAME`"
+_RAPTOR = f"a recurrent policy for quadrotors by its authors' weights, in 58 lines | PyPI | {verified('RAPTOR')}"
+_OWN_POLICY = "a class with `initialize`, `reset` and `act` | `vlagents-ray new policy NAME` | "
 _OWN_ENV = "a subclass of `EvalEnv` | `vlagents-ray new env NAME`"
 TABLES: dict[str, dict[str, list[str]]] = {
     "README.md": {
         "policies": [
             *policies("docs/policies/"),
+            f"| [RAPTOR](docs/tutorials/raptor.md) | {_RAPTOR} |",
             f"| [your own](docs/own_policy.md) | {_OWN_POLICY} |",
         ],
         "environments": [
@@ -82,11 +107,6 @@ def with_tables(file: str, text: str) -> str:
         new = "\n".join([begin, *rows, end])
         text = re.sub(f"{begin}.*?{end}", lambda _, new=new: new, text, flags=re.DOTALL)
     return text
-
-
-def page_of(name: str, one: Adapter) -> str:
-    """Return the name of an adapter's page; empty if it has none."""
-    return name if one.page is None else one.page.partition("#")[0]
 
 
 def main() -> None:

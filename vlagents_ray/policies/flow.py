@@ -232,6 +232,34 @@ class Guide:
         return self.frozen * (noise - self.plan) + (1.0 - self.frozen) * pulled
 
 
+def start_flow(
+    rows: Sequence[Row],
+    shape: tuple[int, int],
+    steps: int,
+    *,
+    noise_level: float,
+    limit: float,
+    convert: Callable[[np.ndarray], Any],
+) -> tuple[Any, list[Change], RandomSteps | None]:
+    """Draw the noise of a batch's flow.
+
+    Args:
+        rows: Those of the batch, with plans in the model's units.
+        shape: The rows and numbers of a chunk, (H, D).
+        steps: The number of steps.
+        noise_level: See `step_mean`.
+        limit: See `Guide.steer`.
+        convert: Makes a tensor of an array, on the model's device.
+
+    Returns:
+        The noise (B, H, D), the changes for `follow`, and the random steps, if any row wants them.
+    """
+    noise = convert(np.stack([row.noise(*shape) for row in rows]))  # before that of the steps, which some rows draw
+    guide, random = Guide.of(rows, *shape), RandomSteps.of(rows, (steps, *shape), noise_level, convert)
+    changes = [] if guide is None else [guide.to(convert).change(noise, steps=steps, limit=limit)]
+    return noise, changes if random is None else [*changes, random.change], random
+
+
 def _weights(delay: int, length: int, horizon: int) -> np.ndarray:
     """Return (horizon,): the paper's soft mask, from about 1 after the frozen rows down to 0 where the plan ends."""
     behind = np.arange(horizon, dtype=np.float32)

@@ -32,7 +32,7 @@ from vlagents_ray.policies.base.model_inputs import (
     state_vector,
 )
 from vlagents_ray.policies.base.staging import StagedRow, Staging
-from vlagents_ray.policies.flow import OFFERED, Change, FlowPasses, Guide, RandomSteps, cache_of, layers_of
+from vlagents_ray.policies.flow import OFFERED, FlowPasses, cache_of, layers_of, start_flow
 from vlagents_ray.registry import require
 
 CAMERAS = ("base_0_rgb", "left_wrist_0_rgb", "right_wrist_0_rgb")  # openpi's names, in the order of the image tokens
@@ -197,15 +197,14 @@ class Pi0(ModelPolicy):
     def predict(self, rows: Sequence[Row]) -> list[Prediction]:
         model, torch = self.loaded(), require("torch")
         shape = (model.network.config.chunk_size, model.network.config.max_action_dim)
-        convert = model.staging.upload
-        noise = convert(np.stack([row.noise(*shape) for row in rows]))
-        guide = Guide.of([model.planned(row) for row in rows], *shape)
-        random = RandomSteps.of(rows, (self._steps, *shape), self.config.noise_level, convert)
-        changes: list[Change] = []
-        if guide is not None:
-            changes.append(guide.to(convert).change(noise, steps=self._steps, limit=self.config.guidance))
-        if random is not None:
-            changes.append(random.change)
+        noise, changes, random = start_flow(
+            [model.planned(row) for row in rows],
+            shape,
+            self._steps,
+            noise_level=self.config.noise_level,
+            limit=self.config.guidance,
+            convert=model.staging.upload,
+        )
         firsts, owners = shared_frames(rows)
         with torch.inference_mode():
             inputs = self._inputs([rows[i] for i in firsts])

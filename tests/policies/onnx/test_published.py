@@ -10,6 +10,7 @@ import numpy as np
 import onnxruntime
 import pytest
 from in_process_replicas import Replicas
+from tables import RATES
 
 from vlagents_ray import Act, Obs
 from vlagents_ray.policies.onnx import Onnx
@@ -116,6 +117,10 @@ MODELS = [
     pytest.param(lambda: Speech("silero_vad"), True, id="speech"),
     pytest.param(lambda: Speech("silero_vad_openvino_16k", one_row=True), False, id="speech-one-row"),
 ]
+
+
+def test_the_table_states_as_many_as_there_are() -> None:
+    assert RATES["onnx"]["equal"] == len(MODELS)
 
 
 def seen(model: Any, seed: int) -> list[Obs]:

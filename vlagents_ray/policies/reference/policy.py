@@ -1,0 +1,198 @@
+"""The reference policy around its network."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, ClassVar
+
+import numpy as np
+from pydantic import Field
+
+from vlagents_ray.contract import ActionSpec, Contract
+from vlagents_ray.errors import ConfigError
+from vlagents_ray.interface import Obs
+from vlagents_ray.policies.base import ModelConfig, ModelPolicy, Prediction, Row, shared_frames
+from vlagents_ray.policies.base.accelerator import fetch, torch_device, torch_dtype
+from vlagents_ray.policies.base.checkpoint import find_checkpoint
+from vlagents_ray.policies.base.config import NoiseLevel
+from vlagents_ray.policies.base.model_inputs import (
+    camera_images,
+    camera_specs,
+    choose_cameras,
+    needs_gripper,
+    resize_with_pad,
+    state_specs,
+    state_vector,
+)
+from vlagents_ray.policies.base.staging import StagedRow, Staging
+from vlagents_ray.policies.flow import OFFERED, FlowPasses, start_flow
+from vlagents_ray.policies.reference.checkpoint import (
+    CAMERAS,
+    CONFIG,
+    WEIGHTS,
+    Checkpoint,
+    Embodiment,
+    normalised,
+    pixels,
+    read_checkpoint,
+)
+from vlagents_ray.registry import require
+
+
+class ReferencePasses(FlowPasses):
+    """The passes of a `ReferenceNetwork`; actions stay in float32 between the steps."""
+
+    def encode(self, tokens: Any, mask: Any, cameras: Any, state: Any, *images: Any) -> tuple[Any, Any]:
+        return self.model.encode(tokens, state, *images), tokens
+
+    def velocity(self, encoded: Any, seen: Any, state: Any, actions: Any, times: Any) -> Any:
+        return self.model.velocity(encoded, actions.to(encoded.dtype), times).float()
+
+
+class ReferenceConfig(ModelConfig):
+    """Settings of the reference policy, in addition to those of all models."""
+
+    embodiment: str | None = Field(
+        default=None, description="the robot, as the checkpoint names it; unset: the only one that it has"
+    )
+    steps: int = Field(default=5, ge=1, description="steps of the flow")
+    guidance: float = Field(default=5.0, gt=0, description="real-time chunking: largest weight of the old plan")
+    noise_level: NoiseLevel = 0.0
+
+
+@dataclass(frozen=True)
+class LoadedReference:
+    """The network, and what its checkpoint states."""
+
+    network: Any
+    checkpoint: Checkpoint
+    robot: Embodiment
+    dtype: Any
+    passes: ReferencePasses
+    staging: Staging
+
+
+class Reference(ModelPolicy):
+    """The reference policy: chunks by flow matching, with one forward pass for all sessions of a batch."""
+
+    Config: ClassVar[type] = ReferenceConfig
+    trainable = network = "model.network"
+    adaptable = True
+    config: ReferenceConfig
+    model: LoadedReference | None
+
+    @property
+    def contract(self) -> Contract:
+        if self.model is None:
+            return Contract(instruction=True, history=1)
+        robot = self.model.robot
+        return Contract(
+            cameras=camera_specs(self.cameras),
+            state=state_specs(self.state, len(robot.state_mean)),
+            gripper=needs_gripper(self.state),
+            instruction=True,
+            action=ActionSpec(**robot.action),
+            chunk=self.chunk(self.model.checkpoint.sizes.horizon),
+            history=1,
+            behaviour=self.offered(OFFERED if self.config.noise_level else ()),
+        )
+
+    @property
+    def state_dim(self) -> int | None:
+        return None if self.model is None else len(self.model.robot.state_mean)
+
+    @property
+    def cameras(self) -> dict[str, str]:
+        """The model's name of each camera -> the robot's, in the order of the network."""
+        chosen = choose_cameras(self.config.cameras, self.loaded().robot.cameras, CAMERAS)
+        return {name: chosen[name] for name in CAMERAS}
+
+    @property
+    def state(self) -> list[str]:
+        """The parts of the robot's proprioception, in the order of its state vector."""
+        return self.config.state or self.loaded().robot.state
+
+    @property
+    def continues_plans(self) -> bool:
+        return self.config.actions == "chunk"
+
+    def load(self) -> LoadedReference:
+        folder = find_checkpoint(self.config.checkpoint, self.config.checkpoint_step, needs=[CONFIG, WEIGHTS])
+        checkpoint = read_checkpoint(folder)
+        robot = _embodiment(checkpoint, self.config.embodiment, folder)
+        device = torch_device(self.config.device)
+        from vlagents_ray.policies.reference.network import read_network  # imports torch
+
+        dtype = torch_dtype(self.config.dtype, device, preferred="float32")
+        network = read_network(checkpoint.sizes, folder)
+        network = network.eval().requires_grad_(False).to(device, dtype)
+        passes = ReferencePasses(network, self.compilation)
+        passes.adapters = self.adapters
+        if self.config.execute is None and robot.execute is not None:
+            self.config = self.config.model_copy(update={"execute": robot.execute})
+        return LoadedReference(network, checkpoint, robot, dtype, passes, Staging(device))
+
+    def _begin(self, instruction: str, seed: int, adapter: str = "") -> None:
+        super()._begin(instruction, seed, adapter)
+        if self.model is not None:
+            self._begun().prompt = self.model.checkpoint.tokens(instruction)
+
+    def _example(self, seed: int, instruction: str = "") -> Row:
+        return super()._example(seed, instruction or self.loaded().checkpoint.words[0])
+
+    def perceive(self, obs: Obs) -> StagedRow:
+        """Return the network's inputs for one row."""
+        model = self.loaded()
+        sizes, found = model.checkpoint.sizes, camera_images(obs, self.cameras)
+        images = np.stack([resize_with_pad(found[name], sizes.side, sizes.side) for name in CAMERAS])
+        state = normalised(model.robot, state_vector(obs, self.state, self.state_dim), sizes.state)
+        staged: StagedRow = model.staging.stage({"tokens": self._begun().prompt, "images": images, "state": state})
+        return staged
+
+    def predict(self, rows: Sequence[Row]) -> list[Prediction]:
+        model, config, torch = self.loaded(), self.config, require("torch")
+        shape = (model.checkpoint.sizes.horizon, model.checkpoint.sizes.action)
+        noise, changes, random = start_flow(
+            rows,
+            shape,
+            config.steps,
+            noise_level=config.noise_level,
+            limit=config.guidance,
+            convert=model.staging.upload,
+        )
+        firsts, owners = shared_frames(rows)
+        with torch.inference_mode():
+            inputs = self._inputs([rows[i] for i in firsts])
+            tokens = inputs["tokens"]
+            flow = model.passes.sample(
+                inputs["images"].unbind(1),
+                [torch.ones(len(tokens), dtype=torch.bool, device=tokens.device)] * len(CAMERAS),
+                tokens,
+                tokens != 0,
+                inputs["state"],
+                noise=noise,
+                owners=owners,
+                steps=config.steps,
+                changes=changes,
+                fingerprints=[row.adapter for row in rows],
+            )
+            stated = {} if random is None else random.stated(config.execute, shape[1])
+        return [Prediction(one, behaviour=stated.get(i, {})) for i, one in enumerate(fetch(flow))]
+
+    def _inputs(self, rows: Sequence[Row]) -> dict[str, Any]:
+        """Stack the last frames of rows, in the type of the network."""
+        model = self.loaded()
+        inputs = model.staging.stack([row.frames[-1] for row in rows])
+        images, state = pixels(inputs["images"]).to(model.dtype), inputs["state"].to(model.dtype)
+        return {"tokens": inputs["tokens"], "images": images, "state": state}
+
+
+def _embodiment(checkpoint: Checkpoint, name: str | None, folder: Path) -> Embodiment:
+    known = checkpoint.embodiments
+    if name is None and len(known) == 1:
+        return next(iter(known.values()))
+    if name not in known:
+        raise ConfigError(f"embodiment: got {name!r}, want one of {sorted(known)}, those of {folder}")
+    return known[name]
