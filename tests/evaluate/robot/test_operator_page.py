@@ -77,4 +77,7 @@ def test_a_scene_is_set_played_and_judged(page: Page, tmp_path: Path, width: int
     require_tidy(page, width)
     outside = [url for url in page.asked if not url.startswith((operator.url, "data:"))]
     assert outside == []
-    assert [one for one in page.said if "400" not in one] == [], "beside the answers that were refused"
+    said = [one for one in page.said if "400" not in one]
+    # The page may ask for one more image while the evaluation, and with it the page's server, ends.
+    said = [one for one in said if not ("/now/camera/" in one and "ERR_CONNECTION_REFUSED" in one)]
+    assert said == [], "beside the answers that were refused"
