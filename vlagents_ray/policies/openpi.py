@@ -20,7 +20,7 @@ from vlagents_ray.interface import Obs
 from vlagents_ray.policies.base import ModelConfig, ModelPolicy, Prediction, Row
 from vlagents_ray.policies.base.accelerator import fetch, jax_device, torch_device
 from vlagents_ray.policies.base.checkpoint import STEP, SavedTensors, find_checkpoint, require_loaded
-from vlagents_ray.policies.base.config import NoiseLevel
+from vlagents_ray.policies.base.config import Guidance, NoiseLevel
 from vlagents_ray.policies.base.model_code import use_source
 from vlagents_ray.policies.base.model_inputs import (
     CLOSED,
@@ -225,7 +225,7 @@ class OpenPiConfig(ModelConfig):
     layout: Layout | None = Field(default=None, description="layout of the images for the transforms: hwc or chw")
     steps: int | None = Field(default=None, ge=1, description="steps of the flow (pi0, pi0.5); unset: openpi's, 10")
     max_decoding_steps: int = Field(default=256, ge=1, description="largest number of tokens of a chunk (pi0-FAST)")
-    guidance: float = Field(default=5.0, gt=0, description="real-time chunking: largest weight of the old plan")
+    guidance: Guidance = 5.0
     noise_level: NoiseLevel = 0.0
     batch_sizes: list[int] | None = Field(
         default=None,

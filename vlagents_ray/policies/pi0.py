@@ -21,7 +21,7 @@ from vlagents_ray.interface import Obs
 from vlagents_ray.policies.base import ModelConfig, ModelPolicy, Prediction, Row, shared_frames
 from vlagents_ray.policies.base.accelerator import ensure_torchvision, fetch, torch_device, torch_dtype
 from vlagents_ray.policies.base.checkpoint import find_checkpoint, from_pretrained
-from vlagents_ray.policies.base.config import NoiseLevel
+from vlagents_ray.policies.base.config import Guidance, NoiseLevel
 from vlagents_ray.policies.base.model_inputs import (
     camera_images,
     camera_specs,
@@ -53,7 +53,7 @@ class Pi0Config(ModelConfig):
     )
     steps: int | None = Field(default=None, ge=1, description="steps of the flow; unset: the checkpoint's, usually 10")
     max_tokens: int = Field(default=48, ge=1, description="tokens of an instruction, as in training; more are refused")
-    guidance: float = Field(default=5.0, gt=0, description="real-time chunking: largest weight of the old plan")
+    guidance: Guidance = 5.0
     noise_level: NoiseLevel = 0.0
 
 

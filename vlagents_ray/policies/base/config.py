@@ -22,6 +22,8 @@ NoiseLevel = Annotated[
     ),
 ]
 
+Guidance = Annotated[float, Field(gt=0, description="real-time chunking: largest weight of the old plan")]
+
 
 class ModelConfig(BaseModel, extra="forbid"):
     """The settings of a model: its checkpoint, its device, its inputs, and how its chunks become actions."""

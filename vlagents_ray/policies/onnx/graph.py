@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from math import prod
 from pathlib import Path
 from typing import Any
@@ -11,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from vlagents_ray.errors import ConfigError
-from vlagents_ray.policies.base.accelerator import onnx_provider, torch_device
+from vlagents_ray.policies.base.accelerator import fetch, onnx_provider, torch_device
 from vlagents_ray.policies.base.checkpoint import find_checkpoint
 from vlagents_ray.policies.onnx.config import OnnxConfig
 from vlagents_ray.registry import require
@@ -23,24 +24,24 @@ _TYPES = {"float": "float32", "double": "float64", "string": "object"}  # those 
 Arrays = Mapping[str, np.ndarray]
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True)
 class Tensor:
     """An input of a graph."""
 
     shape: tuple[int, ...]  # -1: the batch
     dtype: np.dtype[Any]
 
-    @property
+    @cached_property
     def axis(self) -> int | None:
         """The dimension of the batch; None if there is one row."""
         return self.shape.index(-1) if -1 in self.shape else None
 
-    @property
+    @cached_property
     def row(self) -> tuple[int, ...]:
         """The shape with a batch of one."""
         return tuple(abs(length) for length in self.shape)
 
-    @property
+    @cached_property
     def size(self) -> int:
         """How many numbers a row has."""
         return prod(self.row)
@@ -54,7 +55,7 @@ class Tensor:
 
 
 class OnnxGraph:
-    """An ONNX file."""
+    """The graph of an ONNX file, which ONNX Runtime computes."""
 
     def __init__(self, path: Path, config: OnnxConfig) -> None:
         runtime = require("onnxruntime")
@@ -103,7 +104,7 @@ class TorchScript:
         found = found if isinstance(found, tuple | list) else (found,)
         if len(found) != len(self.outputs):
             raise ConfigError(f"outputs: got {self.outputs}, want names for the {len(found)} results of `forward`")
-        return {name: one.float().cpu().numpy() for name, one in zip(self.outputs, found, strict=True)}
+        return {name: fetch(one.float()) for name, one in zip(self.outputs, found, strict=True)}
 
 
 def read_graph(config: OnnxConfig) -> tuple[OnnxGraph | TorchScript, Path]:

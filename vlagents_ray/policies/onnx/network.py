@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -24,7 +25,7 @@ _TOLERANCE = 1e-3  # of outputs alone and in a batch, relative to the largest: m
 
 
 class Network:
-    """What sessions share; they change nothing in it."""
+    """A graph whose inputs and outputs have a meaning; all sessions share it, and change nothing in it."""
 
     def __init__(self, graph: OnnxGraph | TorchScript, path: Path, config: OnnxConfig) -> None:
         """Map the inputs and outputs, and try the graph on random rows; raises `ConfigError` if they do not fit."""
@@ -48,13 +49,13 @@ class Network:
         self._require_fitting(example)
         self.contract = self._contract(*self.chunk(example).shape)
 
-    @property
+    @cached_property
     def remembers(self) -> bool:
         """Whether an act depends on earlier ones of its session, other than by `history`."""
         steps = any(one.step is not None for one in self.options.values())
         return steps or bool(self.config.recurrent) or any(PREVIOUS in parts for parts in self.vectors.values())
 
-    @property
+    @cached_property
     def action(self) -> str:
         """The output that is the action."""
         others = {*self.config.recurrent.values(), *self.config.info}

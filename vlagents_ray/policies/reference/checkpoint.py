@@ -36,14 +36,13 @@ class NetworkSizes(BaseModel, extra="forbid", frozen=True):
 
 
 class Embodiment(BaseModel, extra="forbid", frozen=True):
-    """What differs between the robots of a checkpoint."""
+    """The cameras, the state and the action of one robot of a checkpoint."""
 
     cameras: dict[str, str]  # of CAMERAS -> the robot's
     state: list[str]  # parts of its proprioception, in order
     state_mean: list[float]
     state_std: list[float]
     action: dict[str, Any]  # the `ActionSpec` of its actions, which are in [-1, 1]
-    execute: int | None = None  # rows of a chunk that are executed, as far as it was trained to be
 
 
 def words_of(instruction: str) -> list[str]:

@@ -21,10 +21,8 @@ _TIMES = 32  # frequencies of the flow's time, from 1 to 1000 rad
 _SHARPNESS = 12.0  # of the attention to images: the score of a token that is exactly what a query asks for
 
 
-def _mlp(width: int, out: int | None = None) -> nn.Sequential:
-    return nn.Sequential(
-        nn.LayerNorm(width), nn.Linear(width, 2 * width), nn.GELU(), nn.Linear(2 * width, out or width)
-    )
+def _mlp(width: int) -> nn.Sequential:
+    return nn.Sequential(nn.LayerNorm(width), nn.Linear(width, 2 * width), nn.GELU(), nn.Linear(2 * width, width))
 
 
 class _Eye(nn.Module):
@@ -108,7 +106,6 @@ class ReferenceNetwork(nn.Module):
         self.result = nn.Linear(sizes.head, sizes.horizon * sizes.action)
         side = torch.linspace(-1, 1, sizes.side // sizes.stride)
         self.register_buffer("grid", torch.cartesian_prod(side, side).flip(-1), persistent=False)  # (tokens, 2): x, y
-        self.register_buffer("rates", torch.logspace(0, 3, _TIMES), persistent=False)
 
     def encode(self, tokens: Tensor, state: Tensor, *images: Tensor) -> Tensor:
         """Return the context (P, 2 * head) of words (P, L) int64, states (P, S) and images (P, 3, S, S) in [-1, 1]."""
@@ -124,7 +121,8 @@ class ReferenceNetwork(nn.Module):
 
     def velocity(self, context: Tensor, actions: Tensor, times: Tensor) -> Tensor:
         """Return the velocity, noise minus actions, of noisy actions (B, H, D) at times (B,), 1 being noise."""
-        angles = times[:, None].float() * self.rates.float()
+        # Not a buffer, which a network of bfloat16 would round: the largest rate by several rad.
+        angles = times[:, None].float() * torch.logspace(0, 3, _TIMES, device=times.device)
         when = torch.cat([angles.sin(), angles.cos()], -1).to(context.dtype)
         condition = silu(self.why(context) + self.when(when))
         hidden = self.noisy(actions.flatten(1))

@@ -16,7 +16,7 @@ from vlagents_ray.interface import Obs
 from vlagents_ray.policies.base import ModelConfig, ModelPolicy, Prediction, Row, shared_frames
 from vlagents_ray.policies.base.accelerator import fetch, torch_device, torch_dtype
 from vlagents_ray.policies.base.checkpoint import find_checkpoint
-from vlagents_ray.policies.base.config import NoiseLevel
+from vlagents_ray.policies.base.config import Guidance, NoiseLevel
 from vlagents_ray.policies.base.model_inputs import (
     camera_images,
     camera_specs,
@@ -58,7 +58,7 @@ class ReferenceConfig(ModelConfig):
         default=None, description="the robot, as the checkpoint names it; unset: the only one that it has"
     )
     steps: int = Field(default=5, ge=1, description="steps of the flow")
-    guidance: float = Field(default=5.0, gt=0, description="real-time chunking: largest weight of the old plan")
+    guidance: Guidance = 5.0
     noise_level: NoiseLevel = 0.0
 
 
@@ -69,6 +69,7 @@ class LoadedReference:
     network: Any
     checkpoint: Checkpoint
     robot: Embodiment
+    cameras: dict[str, str]  # of CAMERAS, in their order -> the robot's
     dtype: Any
     passes: ReferencePasses
     staging: Staging
@@ -89,7 +90,7 @@ class Reference(ModelPolicy):
             return Contract(instruction=True, history=1)
         robot = self.model.robot
         return Contract(
-            cameras=camera_specs(self.cameras),
+            cameras=camera_specs(self.model.cameras),
             state=state_specs(self.state, len(robot.state_mean)),
             gripper=needs_gripper(self.state),
             instruction=True,
@@ -102,12 +103,6 @@ class Reference(ModelPolicy):
     @property
     def state_dim(self) -> int | None:
         return None if self.model is None else len(self.model.robot.state_mean)
-
-    @property
-    def cameras(self) -> dict[str, str]:
-        """The model's name of each camera -> the robot's, in the order of the network."""
-        chosen = choose_cameras(self.config.cameras, self.loaded().robot.cameras, CAMERAS)
-        return {name: chosen[name] for name in CAMERAS}
 
     @property
     def state(self) -> list[str]:
@@ -130,9 +125,9 @@ class Reference(ModelPolicy):
         network = network.eval().requires_grad_(False).to(device, dtype)
         passes = ReferencePasses(network, self.compilation)
         passes.adapters = self.adapters
-        if self.config.execute is None and robot.execute is not None:
-            self.config = self.config.model_copy(update={"execute": robot.execute})
-        return LoadedReference(network, checkpoint, robot, dtype, passes, Staging(device))
+        chosen = choose_cameras(self.config.cameras, robot.cameras, CAMERAS)
+        cameras = {name: chosen[name] for name in CAMERAS}
+        return LoadedReference(network, checkpoint, robot, cameras, dtype, passes, Staging(device))
 
     def _begin(self, instruction: str, seed: int, adapter: str = "") -> None:
         super()._begin(instruction, seed, adapter)
@@ -145,7 +140,7 @@ class Reference(ModelPolicy):
     def perceive(self, obs: Obs) -> StagedRow:
         """Return the network's inputs for one row."""
         model = self.loaded()
-        sizes, found = model.checkpoint.sizes, camera_images(obs, self.cameras)
+        sizes, found = model.checkpoint.sizes, camera_images(obs, model.cameras)
         images = np.stack([resize_with_pad(found[name], sizes.side, sizes.side) for name in CAMERAS])
         state = normalised(model.robot, state_vector(obs, self.state, self.state_dim), sizes.state)
         staged: StagedRow = model.staging.stage({"tokens": self._begun().prompt, "images": images, "state": state})
