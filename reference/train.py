@@ -8,13 +8,14 @@ as many threads.
 from __future__ import annotations
 
 import copy
+import json
 import math
 import os
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import numpy as np
 import torch
@@ -35,6 +36,7 @@ from vlagents_ray.policies.reference.checkpoint import (
     words_of,
 )
 from vlagents_ray.policies.reference.network import ReferenceNetwork
+from vlagents_ray.ray_tools.git_state import code_in
 from vlagents_ray.weights.safetensors import write_values
 
 BATCH = 256  # frames
@@ -43,6 +45,7 @@ RATE, DECAY, CLIP = 1e-3, 0.01, 1.0  # of AdamW, and the largest norm of a gradi
 WARM_UP = 200  # steps, after which the rate falls as a cosine
 OBJECTS = 1.0  # weight of the error of the places of objects, which teaches early what words mean in images
 AVERAGE = 0.999  # of the weights, per step; these are what is saved
+MADE = "training.json"
 KEEP_EVERY = 500  # steps between two kept states
 SHOWN_EVERY = 100  # steps between two lines of the log
 
@@ -122,31 +125,47 @@ def batches(frames: int, seed: int) -> Iterator[np.ndarray]:
         yield from (np.sort(order[at : at + BATCH]) for at in range(0, max(frames - BATCH, 0) + 1, BATCH))
 
 
+class Training(torch.nn.Module):  # type: ignore[misc]  # torch's own types are not read
+    """The network, and a guess of the places of objects from its context, which is for the training alone."""
+
+    def __init__(self, sizes: NetworkSizes, objects: int) -> None:
+        super().__init__()
+        self.network = ReferenceNetwork(sizes)
+        self.guess = torch.nn.Linear(2 * sizes.head, objects)
+
+    def forward(
+        self, tokens: torch.Tensor, state: torch.Tensor, images: Sequence[torch.Tensor], noisy: torch.Tensor,
+        times: torch.Tensor,
+    ) -> tuple[torch.Tensor, torch.Tensor]:  # fmt: skip
+        context = self.network.encode(tokens, state, *images)
+        return self.network.velocity(context.repeat(DRAWS, 1), noisy, times), self.guess(context)
+
+
 def loss_of(
-    network: ReferenceNetwork, guess: torch.nn.Module, frames: Frames, batch: np.ndarray, draws: torch.Generator
+    training: Training, frames: Frames, batch: np.ndarray, draws: torch.Generator
 ) -> tuple[torch.Tensor, torch.Tensor]:
     """Return the mean squared error of the flow's velocity over a batch, and the error of the places of objects.
 
-    Times are drawn as for π0 (arXiv 2410.24164), more of them near the noise.
+    Times are drawn as for π0 (arXiv 2410.24164), more of them near the noise. The pass is in bfloat16, from weights of
+    float32.
 
     Args:
-        network: The network.
-        guess: Guesses the places of objects (B, O) from a context; of the training alone.
+        training: The network, and the guess.
         frames: All frames.
         batch: Those of the batch, (B,) among those that are trained with.
         draws: The generator of noise and times.
     """
-    index, horizon = frames.place[batch], network.sizes.horizon
+    index, horizon = frames.place[batch], training.network.sizes.horizon
     rows = index[:, None] + torch.arange(horizon)
     there = (rows < frames.end[index][:, None]).float()[..., None].repeat(DRAWS, 1, 1)
     actions = frames.action[rows.clamp(max=len(frames.action) - 1)].repeat(DRAWS, 1, 1)
     noise = torch.randn(actions.shape, generator=draws)
     times = 1 - 0.999 * torch.rand(len(actions), generator=draws) ** 1.5
     noisy = times[:, None, None] * noise + (1 - times)[:, None, None] * actions
-    images = pixels(torch.from_numpy(frames.images[batch])).unbind(1)
-    with torch.autocast("cpu", torch.bfloat16):
-        context = network.encode(frames.tokens[index], frames.state[index], *images)
-        velocity, guessed = network.velocity(context.repeat(DRAWS, 1), noisy, times), guess(context)
+    images = pixels(torch.from_numpy(frames.images[batch])).bfloat16().unbind(1)
+    low = {name: value.bfloat16() for name, value in training.named_parameters()}
+    inputs = (frames.tokens[index], frames.state[index].bfloat16(), images, noisy.bfloat16(), times)
+    velocity, guessed = torch.func.functional_call(training, low, inputs)
     objects, flow = frames.objects[index], (velocity.float() - (noise - actions)) ** 2 * there
     known = ~objects.isnan()
     off = smooth_l1_loss(guessed.float()[known], objects[known]) if known.any() else torch.zeros(())
@@ -156,31 +175,28 @@ def loss_of(
 def fit(checkpoint: Checkpoint, frames: Frames, steps: int, seed: int, kept: Path) -> ReferenceNetwork:
     """Return the network after so many steps, from the state in the file `kept` if there is one."""
     torch.manual_seed(seed)
-    network = ReferenceNetwork(checkpoint.sizes)
-    guess = torch.nn.Linear(2 * checkpoint.sizes.head, frames.objects.shape[1])
-    average = copy.deepcopy(network)
-    trained = [*network.parameters(), *guess.parameters()]
-    optimizer = torch.optim.AdamW(trained, lr=RATE, weight_decay=DECAY, betas=(0.9, 0.99))
+    training = Training(checkpoint.sizes, frames.objects.shape[1])
+    average = copy.deepcopy(training)
+    own, mean = list(training.parameters()), list(average.parameters())
+    optimizer = torch.optim.AdamW(own, lr=RATE, weight_decay=DECAY, betas=(0.9, 0.99), fused=True)
     first = 0
     if kept.is_file():
         state = torch.load(kept, weights_only=True)
-        network.load_state_dict(state["network"])
-        guess.load_state_dict(state["guess"])
+        training.load_state_dict(state["training"])
         average.load_state_dict(state["average"])
         optimizer.load_state_dict(state["optimizer"])
         first = state["step"]
         typer.echo(f"continues after step {first}")
     begun, losses = time.monotonic(), list[tuple[float, float]]()
-    own, mean = list(network.parameters()), list(average.parameters())
     for step, batch in zip(range(steps), batches(len(frames.place), seed), strict=False):
         if step < first:
             continue
         for group in optimizer.param_groups:
             group["lr"] = RATE * min(1.0, (step + 1) / WARM_UP) * 0.5 * (1 + math.cos(math.pi * step / steps))
-        flow, off = loss_of(network, guess, frames, batch, torch.Generator().manual_seed(seed * 2**32 + step))
+        flow, off = loss_of(training, frames, batch, torch.Generator().manual_seed(seed * 2**32 + step))
         optimizer.zero_grad()
         (flow + OBJECTS * off).backward()
-        torch.nn.utils.clip_grad_norm_(trained, CLIP)
+        torch.nn.utils.clip_grad_norm_(own, CLIP)
         optimizer.step()
         with torch.no_grad():
             torch._foreach_lerp_(mean, own, 1 - min(AVERAGE, (1 + step) / (10 + step)))
@@ -191,16 +207,17 @@ def fit(checkpoint: Checkpoint, frames: Frames, steps: int, seed: int, kept: Pat
             loss, error = np.mean(losses[-SHOWN_EVERY:], axis=0)
             typer.echo(f"step {done} of {steps}: loss {loss:.4f}, objects {error:.4f}, {rate:.0f} frames/s")
         if done % KEEP_EVERY == 0 and done < steps:
-            state = {"network": network.state_dict(), "guess": guess.state_dict(), "average": average.state_dict(),
+            state = {"training": training.state_dict(), "average": average.state_dict(),
                      "optimizer": optimizer.state_dict(), "step": done}  # fmt: skip
             torch.save(state, kept.with_suffix(".part"))
             os.replace(kept.with_suffix(".part"), kept)
-    return average
+    return average.network
 
 
-def save(checkpoint: Checkpoint, network: ReferenceNetwork, folder: Path) -> None:
-    """Write a checkpoint."""
+def save(checkpoint: Checkpoint, network: ReferenceNetwork, folder: Path, trained: dict[str, Any]) -> None:
+    """Write a checkpoint; `trained` states how it was made, for its card."""
     folder.mkdir(parents=True, exist_ok=True)
+    (folder / MADE).write_text(json.dumps(trained, indent=1) + "\n")
     (folder / CONFIG).write_text(checkpoint.model_dump_json(indent=1, exclude_none=True) + "\n")
     with (folder / WEIGHTS).open("wb") as file:
         write_values(file, {name: value.numpy() for name, value in network.state_dict().items()})
@@ -228,7 +245,24 @@ def main(
     typer.echo(
         f"{len(frames.place)} of {len(frames.state)} frames of {len(named)} robots, {len(checkpoint.words)} words"
     )
-    save(checkpoint, fit(checkpoint, frames, steps, seed, work / "state.pt"), out)
+    network = fit(checkpoint, frames, steps, seed, work / "state.pt")
+    infos = {robot: RecordedDataset(data / robot).info for robot in named}
+    code = code_in(Path(__file__).parent)
+    trained = {
+        "robots": {
+            robot: {"episodes": info["total_episodes"], "frames": info["total_frames"]} for robot, info in infos.items()
+        },
+        "trained_frames": len(frames.place),
+        "steps": steps,
+        "batch": BATCH,
+        "seed": seed,
+        "threads": threads,
+        "processor": torch.backends.cpu.get_cpu_capability(),
+        "torch": torch.__version__,
+        "parameters": sum(value.numel() for value in network.parameters()),
+        "commit": code and code.commit,
+    }
+    save(checkpoint, network, out, trained)
 
 
 if __name__ == "__main__":

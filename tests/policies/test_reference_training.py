@@ -97,7 +97,7 @@ def test_what_was_trained_is_served(train: Any, data: Path, tmp_path: Path, monk
 
     monkeypatch.setattr(train, "BATCH", 16)
     checkpoint, frames = train.read(data, CAMERAS, tmp_path / "images")
-    train.save(checkpoint, train.fit(checkpoint, frames, 2, 0, tmp_path / "state.pt"), tmp_path / "checkpoint")
+    train.save(checkpoint, train.fit(checkpoint, frames, 2, 0, tmp_path / "state.pt"), tmp_path / "checkpoint", {})
     policy = Reference.from_config({"checkpoint": str(tmp_path / "checkpoint"), "execute": 4})
     policy.initialize()
     env = Tabletop("stack", width=64, height=64, cameras=("front", "wrist"))

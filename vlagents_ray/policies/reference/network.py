@@ -11,7 +11,7 @@ from pathlib import Path
 
 import torch
 from torch import Tensor, nn
-from torch.nn.functional import gelu, normalize, silu
+from torch.nn.functional import gelu, silu
 
 from vlagents_ray.errors import ConfigError, VLAgentsError
 from vlagents_ray.policies.reference.checkpoint import CAMERAS, WEIGHTS, NetworkSizes
@@ -23,6 +23,10 @@ _SHARPNESS = 12.0  # of the attention to images: the score of a token that is ex
 
 def _mlp(width: int) -> nn.Sequential:
     return nn.Sequential(nn.LayerNorm(width), nn.Linear(width, 2 * width), nn.GELU(), nn.Linear(2 * width, width))
+
+
+def _inverse_norms(vectors: Tensor) -> Tensor:
+    return (vectors.square().sum(-1, keepdim=True) + 1e-6).rsqrt()
 
 
 class _Eye(nn.Module):
@@ -59,7 +63,8 @@ class _Look(nn.Module):
     def forward(self, queries: Tensor, seen: Sequence[tuple[Tensor, Tensor]], grid: Tensor) -> Tensor:
         found = []
         for asked, (keys, values) in zip(self.ask(queries).chunk(len(seen), -1), seen, strict=True):
-            scores = (_SHARPNESS * normalize(asked, dim=-1) @ normalize(keys, dim=-1).transpose(1, 2)).softmax(-1)
+            cosines = asked @ keys.transpose(1, 2) * _inverse_norms(asked) * _inverse_norms(keys).transpose(1, 2)
+            scores = (_SHARPNESS * cosines).softmax(-1)
             found += [scores @ values, scores @ grid.to(scores.dtype)]
         queries = queries + self.answer(torch.cat(found, -1))
         queries = queries + self.among(queries.transpose(1, 2)).transpose(1, 2)

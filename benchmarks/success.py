@@ -1,0 +1,324 @@
+"""Does what makes a policy fast, or carries its images and actions, cost success?
+
+The reference policy plays the same seeds of the tabletop in each way of serving: eager and without Ray, which is the
+standard; compiled, in bfloat16, in 8 bits; in batches; over each transport; with JPEG; with each way of executing
+chunks, at delays; with LoRA merged and apart; after a push; behind `upstream` by each protocol. A paired test
+(McNemar, adjusted by Holm for all ways) compares each with the standard, and so does the equality of all actions of an
+episode, to the bit.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import shutil
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Annotated, Any
+
+import numpy as np
+import typer
+
+from benchmarks.console import Json, save
+from vlagents_ray import RemoteAgent
+from vlagents_ray.cli.console import errors, out
+from vlagents_ray.client.transports.select import TransportName
+from vlagents_ray.errors import ConfigError, VLAgentsError
+from vlagents_ray.evaluate import EvalConfig, PolicyConfig, Results, SuiteConfig, evaluate
+from vlagents_ray.evaluate.plan.config import ClockConfig
+from vlagents_ray.evaluate.results.statistics import Pairs, difference_interval, holm, wilson
+from vlagents_ray.images.codecs import ImageCodec
+from vlagents_ray.interface import Agent
+from vlagents_ray.learn import Publisher
+from vlagents_ray.naming import plain
+from vlagents_ray.policies.adapters import CONFIG as ADAPTER_CONFIG
+from vlagents_ray.policies.adapters import WEIGHTS as ADAPTER_WEIGHTS
+from vlagents_ray.policies.reference import Reference
+from vlagents_ray.policies.reference.checkpoint import CONFIG, WEIGHTS
+from vlagents_ray.policies.upstream import Upstream
+from vlagents_ray.serve.launch.deployment_file import deployment
+from vlagents_ray.serve.launch.server import running_server
+from vlagents_ray.serve.ports import free_port
+from vlagents_ray.weights.safetensors import read_values, write_values
+
+STANDARD = "eager, in this process"
+APP = "reference"
+EXECUTE = 4  # rows of a chunk of 8
+TOGETHER = 16  # episodes of a batch
+QUALITIES = (30, 50, 70, 85, 95)  # of JPEG; 85 is the client's
+DELAYS = (0.0, 0.05, 0.15)  # s
+HZ = 20.0  # of the clock at those delays: none, one and three ticks
+_RAW = ImageCodec("raw")
+_ADAPTED = "context"  # the layer with an adapter of rank 4 of random weights, small enough that success remains
+_KEYS = {
+    "cameras": {"front": "observation/image", "wrist": "observation/wrist_image"},
+    "state": {"xyzrpy": "observation/state"},
+    "gripper": {"key": "observation/gripper"},
+    "instruction": "prompt",
+}
+_VLA_EVAL = {
+    "cameras": {"front": "images/agentview", "wrist": "images/wrist"},
+    "state": {"xyzrpy": "states"},
+    "gripper": {"key": "gripper"},
+    "instruction": "task_description",
+}
+_GR00T = {
+    "preset": "gr00t",
+    "cameras": {"front": "video/front", "wrist": "video/wrist"},
+    "state": {"xyzrpy": "state/xyzrpy"},
+    "gripper": {"key": "state/gripper"},
+    "action": {"arm": {"stop": 3}, "gripper": {"start": 3}},
+}
+PROTOCOLS: dict[str, tuple[str, Any]] = {  # the URL's scheme and path, and the mapping
+    "openpi": ("ws://{host}/openpi", _KEYS),
+    "openpi-batch": ("ws://{host}/openpi", _KEYS),
+    "roboarena": ("ws://{host}/roboarena", _KEYS),
+    "openvla": ("http://{host}/act", _KEYS),
+    "vla_eval": ("ws://{host}/vla-eval", _VLA_EVAL),
+    "gr00t": ("tcp://127.0.0.1:{gr00t}", _GR00T),
+    "vlagents": ("rpyc://127.0.0.1:{vlagents}", None),
+}
+
+
+@dataclass(frozen=True)
+class Way:
+    """A way of serving the reference policy."""
+
+    name: str
+    config: dict[str, Any] = field(default_factory=dict)  # of the policy
+    adapter: bool = False  # acts with the adapter
+    merged: bool = False  # the checkpoint has the adapter in its weights
+    transport: TransportName | None = None  # None: the policy is in this process
+    codec: ImageCodec = _RAW
+    upstream: str | None = None  # a protocol
+    pushed: bool = False  # the server began with other weights
+    together: int = 1  # episodes
+    execute: int = EXECUTE
+    clock: ClockConfig | None = None
+    equal: bool = False  # to the standard, to the bit
+
+
+def ways() -> list[Way]:
+    """Return all ways, the standard first."""
+    return [
+        Way(STANDARD),
+        Way("again", equal=True),
+        Way("torch.compile", {"compile": True}),
+        Way("bfloat16", {"dtype": "bfloat16"}),
+        Way("int8 weights", {"quantization": "int8"}),
+        Way(f"batches of {TOGETHER}", together=TOGETHER),
+        Way(f"batches of {TOGETHER}, bfloat16", {"dtype": "bfloat16"}, together=TOGETHER),
+        *(Way(name, transport=name, equal=True) for name in ("shm", "plasma", "websocket", "http", "handle")),
+        Way("lossless images", transport="websocket", codec=ImageCodec("lossless"), equal=True),
+        *(Way(f"JPEG, quality {one}", transport="websocket", codec=ImageCodec("jpeg", one)) for one in QUALITIES),
+        Way("after a push", transport="shm", pushed=True, equal=True),
+        *(Way(f"upstream, {name}", upstream=name) for name in PROTOCOLS),
+        Way("open loop, all 8 rows", execute=8),
+        Way("ensemble", {"actions": "ensemble"}, execute=1),
+        *(Way(f"async, {1000 * s:.0f} ms", clock=ClockConfig(latency=s, hz=HZ)) for s in DELAYS),
+        *(
+            Way(f"real-time chunking, {1000 * s:.0f} ms", clock=ClockConfig(latency=s, hz=HZ, real_time_chunking=True))
+            for s in DELAYS
+        ),
+        Way("LoRA apart", adapter=True),
+        Way("LoRA merged", merged=True),
+    ]
+
+
+@dataclass(frozen=True)
+class Played:
+    """The episodes of a way, by seed: whether solved, and the digest of the actions."""
+
+    way: Way
+    episodes: dict[int, tuple[bool, str]]
+    act_ms: float  # median of the episodes' medians, transport included
+
+    @property
+    def solved(self) -> int:
+        return sum(solved for solved, _ in self.episodes.values())
+
+
+class Players:
+    """Plays ways, with one server for all of them, which starts with the first that needs it."""
+
+    def __init__(self, checkpoint: Path, folder: Path, episodes: int) -> None:
+        self._checkpoint, self._folder, self._episodes = checkpoint.resolve(), folder.resolve(), episodes
+        self._stack = contextlib.ExitStack()
+        self._server: tuple[str, dict[str, int]] | None = None  # host:port, and the ports of dialects
+
+    def __enter__(self) -> Players:
+        return self
+
+    def __exit__(self, *raised: object) -> None:
+        self._stack.close()
+
+    def play(self, way: Way) -> Played:
+        """Play the episodes of a way that have no result in the folder yet, and return all."""
+        cameras: dict[str, Any] = {"cameras": ["front", "wrist"], "width": 64, "height": 64}
+        suite = SuiteConfig(
+            envs=["tabletop"], env_options=cameras, episodes=self._episodes, num_envs=way.together, clock=way.clock
+        )
+        options: dict[str, Any] = {"adapter": "own"} if way.adapter else {}
+        policy = PolicyConfig(name=way.name, config=way.config, options=options, execute=way.execute)
+        place = self._folder / plain(way.name)
+        plan = EvalConfig(policies=[policy], suites=[suite], out=place, video="none", resume=True)
+        evaluate(plan, agent_factory=lambda: self._agent(way), in_process=True)
+        counted = [one for cell in Results.load(place).cells for one in cell.counted]
+        found = {one.key.seed: (bool(one.success_once), str(one.actions_sha256)) for one in counted}
+        return Played(way, found, float(np.median([one.policy_ms for one in counted if one.policy_ms])))
+
+    def _agent(self, way: Way) -> Agent:
+        if way.upstream is not None:
+            return self._behind(way.upstream)
+        if way.transport is None:
+            return Reference.from_config(self._config(way))
+        host, _ = self._serve()
+        url = f"serve://{APP}" if way.transport in ("plasma", "handle") else f"http://{host}"
+        if way.pushed:
+            self._push()
+        return RemoteAgent(url, transport=way.transport, codec=way.codec)
+
+    def _behind(self, protocol: str) -> Agent:
+        host, ports = self._serve()
+        url, mapping = PROTOCOLS[protocol]
+        rows = 1 if protocol in ("openvla", "vla_eval") else EXECUTE
+        contract = {"action": {"dim": 4}, "chunk": rows}
+        config = {"protocol": protocol, "urls": [url.format(host=host, **ports)], "contract": contract}
+        return Upstream.from_config(config | ({} if mapping is None else {"mapping": mapping}))
+
+    def _config(self, way: Way) -> dict[str, Any]:
+        checkpoint = self._merged() if way.merged else self._checkpoint
+        adapters = {"adapters": {"own": str(self._adapter())}} if way.adapter else {}
+        return {"checkpoint": str(checkpoint), "embodiment": "tabletop", "execute": way.execute} | adapters | way.config
+
+    def _serve(self) -> tuple[str, dict[str, int]]:
+        if self._server is None:
+            ports = {name: free_port() for name in ("gr00t", "vlagents")}
+            dialects = {
+                "openpi": {"mapping": _KEYS},
+                "roboarena": {"mapping": _KEYS, "n_external_cameras": 0},
+                "openvla": {"mapping": _KEYS},
+                "vla_eval": {"mapping": _VLA_EVAL, "execute": EXECUTE},
+                "gr00t": {"mapping": _GR00T, "port": ports["gr00t"]},
+                "vlagents": {"port": ports["vlagents"]},
+            }
+            document = deployment(
+                "reference", config=self._config(Way(STANDARD)), batch={"max_size": 1}, dialects=dialects
+            )
+            document.applications[0].name = APP
+            server = self._stack.enter_context(running_server(document, num_cpus=2))
+            self._server = server.url.removeprefix("http://"), ports
+        return self._server
+
+    def _push(self) -> None:
+        """Push other weights, then those of the checkpoint."""
+        with (self._checkpoint / WEIGHTS).open("rb") as file:
+            values = {name: np.array(value) for name, value in read_values(file).items()}
+        with Publisher(f"serve://{APP}") as learner:
+            learner.push({name: -value for name, value in values.items()}, pin=True)
+            learner.push(values, pin=True)
+
+    def _low_rank(self) -> tuple[np.ndarray, np.ndarray]:
+        """Return A (4, inputs) and B (outputs, 4), whose product has a hundredth of the norm of the layer's weights."""
+        with (self._checkpoint / WEIGHTS).open("rb") as file:
+            weight = np.array(read_values(file)[f"{_ADAPTED}.weight"])
+        rng = np.random.default_rng(0)
+        down, up = (rng.standard_normal(shape, np.float32) for shape in ((4, weight.shape[1]), (weight.shape[0], 4)))
+        return down, up * np.float32(0.01 * np.linalg.norm(weight) / np.linalg.norm(up @ down))
+
+    def _adapter(self) -> Path:
+        folder = self._folder / "adapter"
+        folder.mkdir(parents=True, exist_ok=True)
+        settings = {"peft_type": "LORA", "r": 4, "lora_alpha": 4, "target_modules": [_ADAPTED]}
+        text = json.dumps(settings | {"base_model_name_or_path": str(self._checkpoint)})
+        (folder / ADAPTER_CONFIG).write_text(text)
+        named = zip("AB", self._low_rank(), strict=True)
+        with (folder / ADAPTER_WEIGHTS).open("wb") as file:
+            write_values(file, {f"base_model.model.{_ADAPTED}.lora_{name}.weight": value for name, value in named})
+        return folder
+
+    def _merged(self) -> Path:
+        folder = self._folder / "merged"
+        folder.mkdir(parents=True, exist_ok=True)
+        shutil.copy(self._checkpoint / CONFIG, folder)
+        down, up = self._low_rank()
+        with (self._checkpoint / WEIGHTS).open("rb") as file:
+            values = {name: np.array(value) for name, value in read_values(file).items()}
+        values[f"{_ADAPTED}.weight"] += up @ down
+        with (folder / WEIGHTS).open("wb") as file:
+            write_values(file, values)
+        return folder
+
+
+def compared(standard: Played, others: Sequence[Played]) -> list[dict[str, Any]]:
+    """Return a row for each way: its rate, its difference from the standard, and its equal episodes."""
+    pairs = [_pairs(one, standard) for one in others]
+    adjusted = holm([pair.p_value for pair in pairs])
+    return [
+        {
+            "way": one.way.name,
+            "solved": one.solved,
+            "episodes": len(one.episodes),
+            "interval_95": list(wilson(one.solved, len(one.episodes))),
+            "act_ms": one.act_ms,
+            **pair.to_json(),
+            "difference_95": list(difference_interval([pair])),
+            "p_holm": p,
+            "equal": sum(one.episodes[seed][1] == standard.episodes[seed][1] for seed in standard.episodes),
+            "must_be_equal": one.way.equal,
+        }
+        for one, pair, p in zip(others, pairs, adjusted, strict=True)
+    ]
+
+
+def _pairs(one: Played, standard: Played) -> Pairs:
+    counts = Counter((solved, standard.episodes[seed][0]) for seed, (solved, _) in one.episodes.items())
+    return Pairs(counts[True, True], counts[True, False], counts[False, True], counts[False, False])
+
+
+def markdown(rows: Sequence[Mapping[str, Any]]) -> str:
+    """Return the table of the documentation."""
+    lines = ["| way | success, % | difference | p | equal | ms an act |", "|---|---|---|---|---|---|"]
+    for row in rows:
+        low, high = (f"{100 * bound:.0f}" for bound in row["interval_95"])
+        off, least, most = (100 * value for value in (row["difference"], *row["difference_95"]))
+        equal = "all" if row["equal"] == row["episodes"] else str(row["equal"])
+        lines.append(
+            f"| {row['way']} | {100 * row['solved'] / row['episodes']:.1f} [{low}, {high}] | {off:+.1f} [{least:+.1f}, "
+            f"{most:+.1f}] | {row['p_holm']:.2g} | {equal} | {row['act_ms']:.1f} |"
+        )
+    return "\n".join(lines)
+
+
+def main(
+    checkpoint: Annotated[Path, typer.Option(help="Folder of the reference policy's weights.")] = Path(
+        "reference/checkpoint"
+    ),
+    folder: Annotated[
+        Path, typer.Option("--out", help="Folder of the results; what it has is not played again.")
+    ] = Path("runs/success"),
+    episodes: Annotated[int, typer.Option(min=1, help="Of each way.")] = 500,
+    only: Annotated[str, typer.Option(help="Ways, with semicolons between them; default: all.")] = "",
+    json_file: Json = None,
+) -> None:
+    """Play every way, and print the table."""
+    with errors(), Players(checkpoint, folder, episodes) as players:
+        chosen = [one.strip() for one in only.split(";")] if only else [way.name for way in ways()]
+        if unknown := set(chosen) - {way.name for way in ways()}:
+            raise ConfigError(f"--only: got {sorted(unknown)}, want ways of {[way.name for way in ways()]}")
+        found = []
+        for way in ways():
+            if way.name in (STANDARD, *chosen):
+                found.append(players.play(way))
+                out.print(f"{way.name}: {found[-1].solved} of {len(found[-1].episodes)}", highlight=False)
+        rows = compared(found[0], found)
+        out.print(markdown(rows), highlight=False, soft_wrap=True)
+        save({"ways": rows}, json_file)
+        if broken := [row["way"] for row in rows if row["must_be_equal"] and row["equal"] < row["episodes"]]:
+            raise VLAgentsError(f"actions differ in {broken}, want those of {STANDARD!r} to the bit")
+
+
+if __name__ == "__main__":
+    typer.run(main)

@@ -1,0 +1,101 @@
+"""Writes the card of a reference policy: `python reference/card.py CHECKPOINT EVALUATION...`.
+
+It states the data, the seeds, the commit, the rates of success with their intervals, and the limits.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from pathlib import Path
+
+import typer
+
+from vlagents_ray.evaluate import Results
+from vlagents_ray.evaluate.results.reader import CellResults, rate_of
+from vlagents_ray.policies.reference.checkpoint import read_checkpoint
+
+_TEXT = """---
+license: apache-2.0
+library_name: vlagents-ray
+pipeline_tag: robotics
+tags: [robotics, vision-language-action, flow-matching]
+---
+
+# The reference policy of vlagents-ray
+
+A small vision-language-action policy, to see what a way of serving does to the success of a learned policy. It drives
+simulated grippers only; it knows no other scene, and is not for a real robot.
+
+## Success
+
+On seeds of which no demonstration was recorded, with 95 % intervals (Wilson). *Misled* is the control: its instruction
+names other colours, or another deed, so that a policy that reads it must fail.
+
+{rates}
+
+`vlagents-ray verify NAME.bundle.zip` checks the results behind these rates.
+
+## Data
+
+Demonstrations by scripted experts, recorded and exported by this project (`reference/demonstrations/`). Episodes that
+failed were left out.
+
+| robot | episodes | frames | cameras |
+|---|---|---|---|
+{data}
+
+## Training
+
+- {steps} steps of {batch} frames out of {trained_frames}; seed {seed}; {threads} threads, {processor}, torch {torch}.
+- {millions:.1f} million parameters in float32, `model.safetensors`; sizes, words and robots are in `config.json`.
+- Code: commit {commit}. `make reference` does all of it again, and ends with the same weights on the same processor.
+
+## Limits
+
+- It knows {known} words, and refuses others: {words}.
+- Images of 64 px from the named cameras of these simulators as they render them here; Meta-World's without shadows.
+- A chunk has eight actions; four of them were executed.
+"""
+MADE = "training.json"
+
+
+def rates(results: Sequence[Results]) -> list[str]:
+    """Return the rows of the table of rates, a task each; `misled` is the control, told of other things."""
+    lines = ["| task | success, % | misled, % | seeds |", "|---|---|---|---|"]
+    for one in results:
+        tasks = dict.fromkeys(cell.env for cell in one.cells)
+        for env in tasks:
+            by_policy = {cell.policy: cell for cell in one.cells if cell.env == env}
+            seeds = sorted(result.key.seed for result in by_policy["reference"].counted)
+            said = " | ".join(_rate([by_policy[name]]) for name in ("reference", "misled"))
+            lines.append(f"| `{env}` | {said} | {seeds[0]} to {seeds[-1]} |")
+    return lines
+
+
+def _rate(cells: Sequence[CellResults]) -> str:
+    rate = rate_of(cells, "success_once")
+    low, high = rate.interval
+    return f"{100 * rate.successes / rate.episodes:.1f} [{100 * low:.1f}, {100 * high:.1f}]"
+
+
+def main(checkpoint: Path, evaluations: list[Path]) -> None:
+    """Write README.md into the folder of the checkpoint."""
+    stated, trained = read_checkpoint(checkpoint), json.loads((checkpoint / MADE).read_text())
+    data = [
+        f"| `{name}` | {one['episodes']} | {one['frames']} | {', '.join(stated.embodiments[name].cameras.values())} |"
+        for name, one in trained["robots"].items()
+    ]
+    text = _TEXT.format(
+        **trained,
+        rates="\n".join(rates([Results.load(folder) for folder in evaluations])),
+        data="\n".join(data),
+        millions=trained["parameters"] / 1e6,
+        known=len(stated.words),
+        words=", ".join(stated.words),
+    )
+    (checkpoint / "README.md").write_text(text, encoding="utf-8")
+
+
+if __name__ == "__main__":
+    typer.run(main)

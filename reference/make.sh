@@ -1,0 +1,19 @@
+#!/usr/bin/env bash
+# Makes the reference policy from nothing, in runs/reference: demonstrations, datasets, training, evaluation, bundle,
+# card. What exists is kept, so that an interrupted run continues. `make reference` calls it.
+set -euo pipefail
+cd "$(dirname "$0")/.."
+bin=${BIN:-.venv/bin} runs=runs/reference
+export PYTHONPATH=examples:reference # the experts of Meta-World; the control
+for robot in tabletop metaworld; do
+  "$bin/vlagents-ray" eval "reference/demonstrations/$robot.yaml" --out "$runs/$robot" --resume
+  [ "$robot" = tabletop ] && objects=(--environment-state puck,target) || objects=()
+  [ -d "$runs/data/$robot" ] ||
+    "$bin/vlagents-ray" export "$runs/$robot" "$runs/data/$robot" --to lerobot --successes "${objects[@]}"
+done
+[ -d "$runs/checkpoint" ] ||
+  "$bin/python" reference/train.py "$runs/data" "$runs/checkpoint" --work "$runs/train" --every 2 \
+    --cameras tabletop=front,wrist --cameras metaworld=corner2,gripperPOV
+"$bin/vlagents-ray" eval reference/evaluation.yaml --out "$runs/evaluation" --resume
+"$bin/vlagents-ray" bundle "$runs/evaluation" --out "$runs/checkpoint/evaluation.bundle.zip"
+"$bin/python" reference/card.py "$runs/evaluation" "$runs/checkpoint"

@@ -1,0 +1,21 @@
+"""A control for the reference policy: it is told of other things than its task's."""
+
+from __future__ import annotations
+
+from vlagents_ray.policies.reference import Reference
+
+_COLOURS = {"red": "yellow", "yellow": "green", "green": "blue", "blue": "purple", "purple": "red"}
+_DEEDS = {
+    "button press topdown": "drawer close",
+    "drawer close": "drawer open",
+    "drawer open": "window close",
+    "window close": "button press topdown",
+}
+
+
+class Misled(Reference):
+    """The reference policy, whose instruction names the next colour for each, or another deed."""
+
+    def _begin(self, instruction: str, seed: int, adapter: str = "") -> None:
+        other = _DEEDS.get(instruction) or " ".join(_COLOURS.get(word, word) for word in instruction.split())
+        super()._begin(other, seed, adapter)
