@@ -23,7 +23,7 @@ SHELL := /bin/bash
 .SHELLFLAGS := -eu -o pipefail -c
 .DELETE_ON_ERROR:
 .DEFAULT_GOAL := setup
-.PHONY: setup demo bench gpu gpu-pack check quick test integrations families docs verified extras locks dist sbom fmt lint type clean
+.PHONY: setup demo reference bench gpu gpu-pack check quick test integrations families docs verified extras locks dist sbom fmt lint type clean
 
 VENV ?= .venv
 TORCH ?= torch==2.13.0
@@ -65,6 +65,10 @@ setup: $(STAMP)
 
 demo: setup
 	$(BIN)/vlagents-ray demo
+
+# The reference policy from nothing in runs/reference, in two hours; an interrupted one continues.
+reference: setup
+	BIN=$(BIN) reference/make.sh
 
 # Some minutes; the other policy servers get an environment of their own, in .venv-peers.
 bench: setup

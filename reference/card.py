@@ -80,7 +80,8 @@ def _rate(cells: Sequence[CellResults]) -> str:
 
 
 def main(checkpoint: Path, evaluations: list[Path]) -> None:
-    """Write README.md into the folder of the checkpoint."""
+    """Write README.md, and rates.json: the solved ones and all episodes of each task, into the folder."""
+    results = [Results.load(folder) for folder in evaluations]
     stated, trained = read_checkpoint(checkpoint), json.loads((checkpoint / MADE).read_text())
     data = [
         f"| `{name}` | {one['episodes']} | {one['frames']} | {', '.join(stated.embodiments[name].cameras.values())} |"
@@ -88,13 +89,18 @@ def main(checkpoint: Path, evaluations: list[Path]) -> None:
     ]
     text = _TEXT.format(
         **trained,
-        rates="\n".join(rates([Results.load(folder) for folder in evaluations])),
+        rates="\n".join(rates(results)),
         data="\n".join(data),
         millions=trained["parameters"] / 1e6,
         known=len(stated.words),
         words=", ".join(stated.words),
     )
     (checkpoint / "README.md").write_text(text, encoding="utf-8")
+    solved: dict[str, dict[str, tuple[int, int]]] = {}
+    for cell in (cell for one in results for cell in one.cells if cell.policy == "reference"):
+        rate = rate_of([cell], "success_once")
+        solved.setdefault(cell.env.partition("/")[0], {})[cell.env] = rate.successes, rate.episodes
+    (checkpoint / "rates.json").write_text(json.dumps(solved, indent=1) + "\n")
 
 
 if __name__ == "__main__":

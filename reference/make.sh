@@ -14,6 +14,8 @@ done
 [ -d "$runs/checkpoint" ] ||
   "$bin/python" reference/train.py "$runs/data" "$runs/checkpoint" --work "$runs/train" --every 2 \
     --cameras tabletop=front,wrist --cameras metaworld=corner2,gripperPOV
-"$bin/vlagents-ray" eval reference/evaluation.yaml --out "$runs/evaluation" --resume
-"$bin/vlagents-ray" bundle "$runs/evaluation" --out "$runs/checkpoint/evaluation.bundle.zip"
-"$bin/python" reference/card.py "$runs/evaluation" "$runs/checkpoint"
+for robot in tabletop metaworld; do
+  "$bin/vlagents-ray" eval "reference/evaluations/$robot.yaml" --out "$runs/evaluations/$robot" --resume
+  "$bin/vlagents-ray" bundle "$runs/evaluations/$robot" --out "$runs/checkpoint/$robot.bundle.zip"
+done
+"$bin/python" reference/card.py "$runs/checkpoint" "$runs/evaluations/tabletop" "$runs/evaluations/metaworld"

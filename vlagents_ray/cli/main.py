@@ -45,18 +45,24 @@ app.command("serve")(serve_command)
 
 @app.command()
 def demo(out_dir: Annotated[Path, typer.Option("--out", help="Folder of the results.")] = Path("runs/demo")) -> None:
-    """Try it in a few minutes: serve the scripted policy, evaluate it in two environments, record videos."""
+    """Try it in a minute: serve a policy, evaluate it on the tabletop, record videos.
+
+    In a checkout this is the reference policy, which was trained; elsewhere the scripted one, which needs no weights.
+    """
     from vlagents_ray.cli.evaluation import run_evaluation
-    from vlagents_ray.envs.maniskill import ManiSkill
     from vlagents_ray.evaluate import EvalConfig, PolicyConfig, SuiteConfig
 
+    policy = PolicyConfig(name="scripted", source="scripted")
+    if (rates := Path("reference/checkpoint/rates.json")).is_file():
+        solved, episodes = map(sum, zip(*json.loads(rates.read_text())["tabletop"].values(), strict=True))
+        said = (
+            f"solves {100 * solved / episodes:.0f} % of {episodes} such episodes; its card is {rates.parent}/README.md"
+        )
+        out.print(f"The policy was learned from demonstrations, and {said}.")
+        policy = PolicyConfig(name="reference", source="deployments/reference.yaml", execute=4)
+    tasks = ["tabletop/pick_place", "tabletop/slide", "tabletop/stack", "tabletop/lift"]
+    suite = SuiteConfig(envs=tasks, env_options={"cameras": ["front", "wrist"], "width": 64, "height": 64}, episodes=5)
     with errors():
-        missing = ManiSkill.missing()
-        suite = SuiteConfig(envs=["maniskill/PushCube-v1", "maniskill/PickCube-v1"], episodes=10)
-        if missing is not None:
-            out.print(f"ManiSkill cannot render here, so the demo uses the tabletop: {missing}", style="yellow")
-            suite = SuiteConfig(envs=["tabletop"], episodes=20)
-        policy = PolicyConfig(name="scripted", source="scripted")
         run_evaluation(EvalConfig(policies=[policy], suites=[suite], workers=2, video="all", out=fresh(out_dir)))
 
 

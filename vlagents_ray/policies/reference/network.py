@@ -18,6 +18,7 @@ from vlagents_ray.policies.reference.checkpoint import CAMERAS, WEIGHTS, Network
 from vlagents_ray.weights.safetensors import read_values
 
 _TIMES = 32  # frequencies of the flow's time, from 1 to 1000 rad
+_CONTRAST = 1e-2  # added to a patch's variance, so that the noise of an empty one is not made large
 _SHARPNESS = 12.0  # of the attention to images: the score of a token that is exactly what a query asks for
 
 
@@ -39,7 +40,7 @@ class _Eye(nn.Module):
         super().__init__()
         width, pixels = sizes.token_width, 3 * sizes.patch**2
         self.cut = nn.Unfold(sizes.patch, padding=(sizes.patch - sizes.stride) // 2, stride=sizes.stride)
-        self.patches = nn.Sequential(nn.LayerNorm(pixels), nn.Linear(pixels, width), nn.LayerNorm(width))
+        self.patches = nn.Sequential(nn.LayerNorm(pixels, _CONTRAST), nn.Linear(pixels, width), nn.LayerNorm(width))
         self.places = nn.Parameter(0.02 * torch.randn((sizes.side // sizes.stride) ** 2, width))
         self.mix = _mlp(width)
         self.keys = nn.Sequential(nn.LayerNorm(width), nn.Linear(width, 2 * sizes.looks * width))
