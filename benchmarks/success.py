@@ -20,12 +20,13 @@ from typing import Annotated, Any
 
 import numpy as np
 import typer
+from rich.table import Table
 
 from benchmarks.console import Json, save
 from vlagents_ray import RemoteAgent
-from vlagents_ray.cli.console import errors, out
+from vlagents_ray.cli.console import errors, out, table
 from vlagents_ray.client.transports.select import TransportName
-from vlagents_ray.errors import ConfigError, VLAgentsError
+from vlagents_ray.errors import ConfigError, MissingDependency, VLAgentsError
 from vlagents_ray.evaluate import EvalConfig, PolicyConfig, Results, SuiteConfig, evaluate
 from vlagents_ray.evaluate.plan.config import ClockConfig
 from vlagents_ray.evaluate.results.statistics import Pairs, difference_interval, holm, wilson
@@ -71,6 +72,12 @@ _GR00T = {
     "gripper": {"key": "state/gripper"},
     "action": {"arm": {"stop": 3}, "gripper": {"start": 3}},
 }
+_VLAGENTS = {
+    "cameras": {"front": "arm/cameras/front", "wrist": "arm/cameras/wrist"},
+    "state": {"xyzrpy": "arm/xyzrpy"},
+    "gripper": {"key": "arm/gripper"},
+    "instruction": "language_instruction",
+}
 PROTOCOLS: dict[str, tuple[str, Any]] = {  # the URL's scheme and path, and the mapping
     "openpi": ("ws://{host}/openpi", _KEYS),
     "openpi-batch": ("ws://{host}/openpi", _KEYS),
@@ -78,7 +85,7 @@ PROTOCOLS: dict[str, tuple[str, Any]] = {  # the URL's scheme and path, and the 
     "openvla": ("http://{host}/act", _KEYS),
     "vla_eval": ("ws://{host}/vla-eval", _VLA_EVAL),
     "gr00t": ("tcp://127.0.0.1:{gr00t}", _GR00T),
-    "vlagents": ("rpyc://127.0.0.1:{vlagents}", None),
+    "vlagents": ("rpyc://127.0.0.1:{vlagents}", _VLAGENTS),
 }
 
 
@@ -105,11 +112,10 @@ def ways() -> list[Way]:
     return [
         Way(STANDARD),
         Way("again", equal=True),
-        Way("torch.compile", {"compile": True}),
+        Way("torch.compile", {"compile": "require", "batch_sizes": [1]}),
         Way("bfloat16", {"dtype": "bfloat16"}),
         Way("int8 weights", {"quantization": "int8"}),
-        Way(f"batches of {TOGETHER}", together=TOGETHER),
-        Way(f"batches of {TOGETHER}, bfloat16", {"dtype": "bfloat16"}, together=TOGETHER),
+        Way(f"batches of {TOGETHER}", transport="shm", together=TOGETHER),
         *(Way(name, transport=name, equal=True) for name in ("shm", "plasma", "websocket", "http", "handle")),
         Way("lossless images", transport="websocket", codec=ImageCodec("lossless"), equal=True),
         *(Way(f"JPEG, quality {one}", transport="websocket", codec=ImageCodec("jpeg", one)) for one in QUALITIES),
@@ -183,10 +189,10 @@ class Players:
     def _behind(self, protocol: str) -> Agent:
         host, ports = self._serve()
         url, mapping = PROTOCOLS[protocol]
-        rows = 1 if protocol in ("openvla", "vla_eval") else EXECUTE
+        rows = 1 if protocol == "vla_eval" else EXECUTE
         contract = {"action": {"dim": 4}, "chunk": rows}
         config = {"protocol": protocol, "urls": [url.format(host=host, **ports)], "contract": contract}
-        return Upstream.from_config(config | ({} if mapping is None else {"mapping": mapping}))
+        return Upstream.from_config(config | {"mapping": mapping})
 
     def _config(self, way: Way) -> dict[str, Any]:
         checkpoint = self._merged() if way.merged else self._checkpoint
@@ -199,14 +205,16 @@ class Players:
             dialects = {
                 "openpi": {"mapping": _KEYS},
                 "roboarena": {"mapping": _KEYS, "n_external_cameras": 0},
-                "openvla": {"mapping": _KEYS},
+                "openvla": {"mapping": _KEYS, "chunk": True},
                 "vla_eval": {"mapping": _VLA_EVAL, "execute": EXECUTE},
                 "gr00t": {"mapping": _GR00T, "port": ports["gr00t"]},
                 "vlagents": {"port": ports["vlagents"]},
             }
-            document = deployment(
-                "reference", config=self._config(Way(STANDARD)), batch={"max_size": 1}, dialects=dialects
-            )
+            config, batch = (
+                self._config(Way(STANDARD)),
+                {"max_size": TOGETHER},
+            )  # one session acts alone: a batch of one
+            document = deployment("reference", config=config, batch=batch, dialects=dialects)
             document.applications[0].name = APP
             server = self._stack.enter_context(running_server(document, num_cpus=2))
             self._server = server.url.removeprefix("http://"), ports
@@ -273,23 +281,20 @@ def compared(standard: Played, others: Sequence[Played]) -> list[dict[str, Any]]
     ]
 
 
+def shown(rows: Sequence[Mapping[str, Any]]) -> Table:
+    """Return the table for the terminal; that of the documentation is made by tests/support/tables.py."""
+    found = table("way", "success, %", "difference", "p", "equal", "ms an act")
+    for row in rows:
+        low, high = (f"{100 * bound:.0f}" for bound in row["interval_95"])
+        rate = f"{100 * row['solved'] / row['episodes']:.1f} [{low}, {high}]"
+        cells = rate, f"{100 * row['difference']:+.1f}", f"{row['p_holm']:.2g}", row["equal"], f"{row['act_ms']:.2f}"
+        found.add_row(row["way"], *map(str, cells))
+    return found
+
+
 def _pairs(one: Played, standard: Played) -> Pairs:
     counts = Counter((solved, standard.episodes[seed][0]) for seed, (solved, _) in one.episodes.items())
     return Pairs(counts[True, True], counts[True, False], counts[False, True], counts[False, False])
-
-
-def markdown(rows: Sequence[Mapping[str, Any]]) -> str:
-    """Return the table of the documentation."""
-    lines = ["| way | success, % | difference | p | equal | ms an act |", "|---|---|---|---|---|---|"]
-    for row in rows:
-        low, high = (f"{100 * bound:.0f}" for bound in row["interval_95"])
-        off, least, most = (100 * value for value in (row["difference"], *row["difference_95"]))
-        equal = "all" if row["equal"] == row["episodes"] else str(row["equal"])
-        lines.append(
-            f"| {row['way']} | {100 * row['solved'] / row['episodes']:.1f} [{low}, {high}] | {off:+.1f} [{least:+.1f}, "
-            f"{most:+.1f}] | {row['p_holm']:.2g} | {equal} | {row['act_ms']:.1f} |"
-        )
-    return "\n".join(lines)
 
 
 def main(
@@ -308,14 +313,20 @@ def main(
         chosen = [one.strip() for one in only.split(";")] if only else [way.name for way in ways()]
         if unknown := set(chosen) - {way.name for way in ways()}:
             raise ConfigError(f"--only: got {sorted(unknown)}, want ways of {[way.name for way in ways()]}")
-        found = []
+        found, skipped = list[Played](), dict[str, str]()
         for way in ways():
-            if way.name in (STANDARD, *chosen):
+            if way.name not in (STANDARD, *chosen):
+                continue
+            try:
                 found.append(players.play(way))
-                out.print(f"{way.name}: {found[-1].solved} of {len(found[-1].episodes)}", highlight=False)
+            except MissingDependency as error:
+                skipped[way.name] = str(error)
+                out.print(f"{way.name}: skipped: {error}", style="yellow")
+            else:
+                out.print(f"{way.name}: {found[-1].solved} of {len(found[-1].episodes)}")
         rows = compared(found[0], found)
-        out.print(markdown(rows), highlight=False, soft_wrap=True)
-        save({"ways": rows}, json_file)
+        out.print(shown(rows))
+        save({"ways": rows, "skipped": skipped}, json_file)
         if broken := [row["way"] for row in rows if row["must_be_equal"] and row["equal"] < row["episodes"]]:
             raise VLAgentsError(f"actions differ in {broken}, want those of {STANDARD!r} to the bit")
 

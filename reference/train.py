@@ -13,6 +13,7 @@ import math
 import os
 import time
 from collections.abc import Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
@@ -41,7 +42,7 @@ from vlagents_ray.weights.safetensors import write_values
 
 BATCH = 256  # frames
 DRAWS = 4  # times that a frame's context is used in a step, each with noise of its own: they cost little
-RATE, DECAY, CLIP = 1e-3, 0.01, 1.0  # of AdamW, and the largest norm of a gradient
+RATE, DECAY, CLIP = 3e-3, 0.01, 1.0  # of AdamW, and the largest norm of a gradient
 WARM_UP = 200  # steps, after which the rate falls as a cosine
 OBJECTS = 1.0  # weight of the error of the places of objects, which teaches early what words mean in images
 AVERAGE = 0.999  # of the weights, per step; these are what is saved
@@ -146,11 +147,10 @@ def loss_of(
 ) -> tuple[torch.Tensor, torch.Tensor]:
     """Return the mean squared error of the flow's velocity over a batch, and the error of the places of objects.
 
-    Times are drawn as for π0 (arXiv 2410.24164), more of them near the noise. The pass is in bfloat16, from weights of
-    float32.
+    Times are drawn as for π0 (arXiv 2410.24164), more of them near the noise.
 
     Args:
-        training: The network, and the guess.
+        training: The network, and the guess, in bfloat16.
         frames: All frames.
         batch: Those of the batch, (B,) among those that are trained with.
         draws: The generator of noise and times.
@@ -163,21 +163,26 @@ def loss_of(
     times = 1 - 0.999 * torch.rand(len(actions), generator=draws) ** 1.5
     noisy = times[:, None, None] * noise + (1 - times)[:, None, None] * actions
     images = pixels(torch.from_numpy(frames.images[batch])).bfloat16().unbind(1)
-    low = {name: value.bfloat16() for name, value in training.named_parameters()}
-    inputs = (frames.tokens[index], frames.state[index].bfloat16(), images, noisy.bfloat16(), times)
-    velocity, guessed = torch.func.functional_call(training, low, inputs)
+    state = frames.state[index].bfloat16()
+    velocity, guessed = training(frames.tokens[index], state, images, noisy.bfloat16(), times)
     objects, flow = frames.objects[index], (velocity.float() - (noise - actions)) ** 2 * there
     known = ~objects.isnan()
     off = smooth_l1_loss(guessed.float()[known], objects[known]) if known.any() else torch.zeros(())
     return flow.sum() / there.sum() / actions.shape[-1], off
 
 
-def fit(checkpoint: Checkpoint, frames: Frames, steps: int, seed: int, kept: Path) -> ReferenceNetwork:
-    """Return the network after so many steps, from the state in the file `kept` if there is one."""
+def fit(
+    checkpoint: Checkpoint, frames: Frames, steps: int, seed: int, kept: Path, threads: int = 1
+) -> ReferenceNetwork:
+    """Return the network after so many steps, from the state in the file `kept` if there is one.
+
+    Each thread has a part of a batch, which is 1.4 times as fast as operations of several threads.
+    """
     torch.manual_seed(seed)
     training = Training(checkpoint.sizes, frames.objects.shape[1])
     average = copy.deepcopy(training)
     own, mean = list(training.parameters()), list(average.parameters())
+    copies = [copy.deepcopy(training).bfloat16() for _ in range(threads)]
     optimizer = torch.optim.AdamW(own, lr=RATE, weight_decay=DECAY, betas=(0.9, 0.99), fused=True)
     first = 0
     if kept.is_file():
@@ -187,24 +192,36 @@ def fit(checkpoint: Checkpoint, frames: Frames, steps: int, seed: int, kept: Pat
         optimizer.load_state_dict(state["optimizer"])
         first = state["step"]
         typer.echo(f"continues after step {first}")
+
+    def gradients(part: tuple[int, int, np.ndarray]) -> tuple[tuple[float, float], tuple[torch.Tensor, ...]]:
+        step, number, rows = part
+        low = list(copies[number].parameters())
+        with torch.no_grad():
+            torch._foreach_copy_(low, own)
+        draws = torch.Generator().manual_seed((seed * 2**32 + step) * threads + number)
+        flow, off = loss_of(copies[number], frames, rows, draws)
+        return (flow.item(), off.item()), torch.autograd.grad(flow + OBJECTS * off, low, materialize_grads=True)
+
+    pool = ThreadPoolExecutor(threads, initializer=torch.set_num_threads, initargs=(1,))
     begun, losses = time.monotonic(), list[tuple[float, float]]()
     for step, batch in zip(range(steps), batches(len(frames.place), seed), strict=False):
         if step < first:
             continue
         for group in optimizer.param_groups:
             group["lr"] = RATE * min(1.0, (step + 1) / WARM_UP) * 0.5 * (1 + math.cos(math.pi * step / steps))
-        flow, off = loss_of(training, frames, batch, torch.Generator().manual_seed(seed * 2**32 + step))
-        optimizer.zero_grad()
-        (flow + OBJECTS * off).backward()
+        parts = [(step, number, part) for number, part in enumerate(np.array_split(batch, threads))]
+        found = list(pool.map(gradients, parts))
+        for number, value in enumerate(own):
+            value.grad = torch.stack([grads[number] for _, grads in found]).float().mean(0)
         torch.nn.utils.clip_grad_norm_(own, CLIP)
         optimizer.step()
         with torch.no_grad():
             torch._foreach_lerp_(mean, own, 1 - min(AVERAGE, (1 + step) / (10 + step)))
-        losses.append((flow.item(), off.item()))
+        losses += [loss for loss, _ in found]
         done = step + 1
         if done % SHOWN_EVERY == 0 or done == steps:
             rate = (done - first) * BATCH / (time.monotonic() - begun)
-            loss, error = np.mean(losses[-SHOWN_EVERY:], axis=0)
+            loss, error = np.mean(losses[-threads * SHOWN_EVERY :], axis=0)
             typer.echo(f"step {done} of {steps}: loss {loss:.4f}, objects {error:.4f}, {rate:.0f} frames/s")
         if done % KEEP_EVERY == 0 and done < steps:
             state = {"training": training.state_dict(), "average": average.state_dict(),
@@ -227,7 +244,7 @@ def main(
     data: Annotated[Path, typer.Argument(help="Folder with a LeRobotDataset for each robot.")],
     out: Annotated[Path, typer.Argument(help="Folder of the checkpoint.")],
     cameras: Annotated[list[str], typer.Option(help="ROBOT=SCENE,WRIST: the robot's names of the cameras.")],
-    steps: Annotated[int, typer.Option(min=1, help=f"Of {BATCH} frames each.")] = 12000,
+    steps: Annotated[int, typer.Option(min=1, help=f"Of {BATCH} frames each.")] = 11000,
     seed: Annotated[int, typer.Option(min=0)] = 0,
     every: Annotated[int, typer.Option(min=1, help="Of so many frames of an episode, one is trained with.")] = 1,
     threads: Annotated[int, typer.Option(min=1, help="Others round differently.")] = 2,
@@ -236,7 +253,6 @@ def main(
     ),
 ) -> None:
     """Train, and write the checkpoint."""
-    torch.set_num_threads(threads)
     torch.use_deterministic_algorithms(True)
     work.mkdir(parents=True, exist_ok=True)
     named = {robot: dict(zip(CAMERAS, names.split(","), strict=True)) for robot, _, names in
@@ -245,7 +261,7 @@ def main(
     typer.echo(
         f"{len(frames.place)} of {len(frames.state)} frames of {len(named)} robots, {len(checkpoint.words)} words"
     )
-    network = fit(checkpoint, frames, steps, seed, work / "state.pt")
+    network = fit(checkpoint, frames, steps, seed, work / "state.pt", threads)
     infos = {robot: RecordedDataset(data / robot).info for robot in named}
     code = code_in(Path(__file__).parent)
     trained = {

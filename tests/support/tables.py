@@ -18,6 +18,8 @@ from vlagents_ray.registry import ENVS, POLICIES, Adapter
 
 ROOT = Path(__file__).parents[2]
 RATES = json.loads((ROOT / "tests/rates.json").read_text())  # which the tests that it names find again
+LEARNT = json.loads((ROOT / "reference/checkpoint/rates.json").read_text())  # of the reference policy, by simulator
+WAYS = json.loads((ROOT / "reference/success.json").read_text())["ways"]  # of serving it, by `benchmarks.success`
 PLUGINS = ("arro",)  # pages among those of the policies, of packages in plugins/
 
 
@@ -40,13 +42,26 @@ def page_of(name: str, one: Adapter) -> str:
     return name if one.page is None else one.page.partition("#")[0]
 
 
+def share(solved: int, episodes: int, digits: int = 0) -> str:
+    """Return a rate of success in per cent, with its interval."""
+    values = (solved / episodes, *wilson(solved, episodes))
+    rate, low, high = (f"{100 * value:.{digits}f}" for value in values)
+    return f"{rate} [{low}, {high}]"
+
+
+def total(simulator: str) -> tuple[int, int]:
+    """Return the episodes that the reference policy solved in a simulator, and all."""
+    solved, episodes = map(sum, zip(*LEARNT[simulator].values(), strict=True))
+    return solved, episodes
+
+
 def verified(name: str, family: str = "") -> str:
     """Return what tests have verified of a policy; `family` is its folder in tests/families."""
     rate = RATES.get(name, {})
+    if name == "reference":
+        rate = dict(zip(("successes", "episodes"), total("tabletop"), strict=True))
     if "successes" in rate:
-        low, high = wilson(rate["successes"], rate["episodes"])
-        share = rate["successes"] / rate["episodes"]
-        return f"✓ {100 * share:.0f} % [{100 * low:.0f}, {100 * high:.0f}] of {rate['episodes']}"
+        return f"✓ {share(rate['successes'], rate['episodes'])} % of {rate['episodes']}"
     parity = {test for test, what in marked(family) if what == "parity"} if family else set()
     cases = [one["tests"].get(test, {}).get("passed", 0) for one in notes(family) for test in parity] if parity else []
     return "◇" if any(cases) or rate.get("equal") else "○"
@@ -61,19 +76,46 @@ def policies(folder: str = "") -> Iterator[str]:
         yield f"| {_link(name, f'`{name}`', one, folder)} | {one.about} | {one.wants or source} | {said} |"
 
 
+def simulated(name: str) -> str:
+    """Return what was verified of an environment."""
+    if name in LEARNT:
+        solved, episodes = total(name)
+        return f"✓ {share(solved, episodes)} % of {episodes}"
+    expert = RATES["simulators"].get(name)
+    return "○" if expert is None else f"◇ {expert['solved']} of {expert['episodes']}"
+
+
 def environments(folder: str = "") -> Iterator[str]:
     """Yield the rows of the environments; `folder` leads to docs/benchmarks."""
-    yield from ("| environment | tasks | needs |", "|---|---|---|")
+    yield from ("| environment | tasks | needs | verified |", "|---|---|---|---|")
     for name, one in _listed(ENVS):
         packages = [f"`'.[{one.extra}]'`"] if one.extra else []
         packages += [f"`requirements/{file}.txt`" for file in one.requirements]
         wants = "; ".join(filter(None, (" or ".join(packages), one.wants)))
-        yield f"| {_link(name, f'`{name}{one.tasks}`', one, folder)} | {one.about} | {wants}".rstrip() + " |"
+        yield f"| {_link(name, f'`{name}{one.tasks}`', one, folder)} | {one.about} | {wants} | {simulated(name)} |"
+
+
+def rates() -> Iterator[str]:
+    """Yield the rows of the success of the reference policy by task."""
+    yield from ("| task | success, % | episodes |", "|---|---|---|")
+    for tasks in LEARNT.values():
+        for env, (solved, episodes) in tasks.items():
+            yield f"| `{env}` | {share(solved, episodes, 1)} | {episodes} |"
+
+
+def ways() -> Iterator[str]:
+    """Yield the rows of the ways of serving the reference policy."""
+    yield from ("| way | success, % | difference | p | equal | ms an act |", "|---|---|---|---|---|---|")
+    for row in WAYS:
+        off, low, high = (f"{100 * value:+.1f}" for value in (row["difference"], *row["difference_95"]))
+        equal = "all" if row["equal"] == row["episodes"] else row["equal"]
+        rate = share(row["solved"], row["episodes"], 1)
+        yield f"| {row['way']} | {rate} | {off} [{low}, {high}] | {row['p_holm']:.2g} | {equal} | {row['act_ms']:.1f} |"
 
 
 _RAPTOR = f"a recurrent policy for quadrotors by its authors' weights, in 58 lines | PyPI | {verified('RAPTOR')}"
 _OWN_POLICY = "a class with `initialize`, `reset` and `act` | `vlagents-ray new policy NAME` | "
-_OWN_ENV = "a subclass of `EvalEnv` | `vlagents-ray new env NAME`"
+_OWN_ENV = "a subclass of `EvalEnv` | `vlagents-ray new env NAME` | "
 TABLES: dict[str, dict[str, list[str]]] = {
     "README.md": {
         "policies": [
@@ -87,6 +129,7 @@ TABLES: dict[str, dict[str, list[str]]] = {
         ],
     },
     "docs/policies/index.md": {"policies": list(policies())},
+    "docs/policies/reference.md": {"rates": list(rates()), "success": list(ways())},
     "docs/benchmarks/index.md": {"environments": list(environments())},
 }
 

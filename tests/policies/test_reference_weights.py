@@ -1,0 +1,63 @@
+"""The weights of the reference policy that this repository has: they succeed as its card says."""
+
+from __future__ import annotations
+
+import importlib.util
+import json
+import shutil
+import sys
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from vlagents_ray.evaluate import EvalConfig, Results, SuiteConfig, evaluate
+from vlagents_ray.evaluate.bundle.verification import verify
+from vlagents_ray.evaluate.results.statistics import wilson
+from vlagents_ray.policies.reference import Reference
+
+pytest.importorskip("torch")
+pytestmark = pytest.mark.torch
+
+ROOT = Path(__file__).parents[2]
+CHECKPOINT = ROOT / "reference/checkpoint"
+RATES = json.loads((CHECKPOINT / "rates.json").read_text())
+EPISODES = 30
+TASKS = [env for env, (solved, episodes) in RATES["tabletop"].items() if solved / episodes > 0.8]
+
+
+def test_they_are_small_enough_for_a_repository() -> None:
+    assert (CHECKPOINT / "model.safetensors").stat().st_size < 20e6
+    assert sum(file.stat().st_size for file in CHECKPOINT.iterdir()) < 25e6
+
+
+@pytest.mark.parametrize("env", TASKS)
+def test_they_succeed_as_often_as_their_card_says(env: str, tmp_path: Path) -> None:
+    solved, episodes = RATES["tabletop"][env]
+    options: dict[str, Any] = {"cameras": ["front", "wrist"], "width": 64, "height": 64}
+    suite = SuiteConfig(envs=[env], env_options=options, episodes=EPISODES, seeds=[10_000])  # seeds of no evaluation
+    plan = EvalConfig(policies=[{"name": "reference", "execute": 4}], suites=[suite], out=tmp_path, video="none")
+    config = {"checkpoint": str(CHECKPOINT), "embodiment": "tabletop"}
+    found = evaluate(plan, agent_factory=lambda: Reference.from_config(config), in_process=True).total
+    assert (
+        found.success_once.successes / EPISODES >= wilson(solved, episodes)[0] - 0.15
+    )  # 30 episodes: a deviation of 0.05
+    [cell] = Results.load(tmp_path).cells
+    assert len({one.actions_sha256 for one in cell.counted}) == EPISODES
+
+
+def test_their_card_and_rates_are_those_of_their_bundles(tmp_path: Path) -> None:
+    spec = importlib.util.spec_from_file_location("reference_card", ROOT / "reference/card.py")
+    assert spec is not None
+    assert spec.loader is not None
+    card = sys.modules["reference_card"] = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(card)
+    shutil.copytree(CHECKPOINT, tmp_path / "checkpoint")
+    evaluations = []
+    for bundle in sorted(CHECKPOINT.glob("*.bundle.zip"), reverse=True):
+        into = tmp_path / bundle.name.partition(".")[0]
+        assert verify(bundle, replay=0, into=into).holds
+        evaluations.append(into)
+    card.main(tmp_path / "checkpoint", evaluations)
+    for name in ("README.md", "rates.json"):
+        assert (tmp_path / "checkpoint" / name).read_text() == (CHECKPOINT / name).read_text()
