@@ -8,7 +8,7 @@ import pytest
 import typer
 from typer.testing import CliRunner
 
-from benchmarks import autoscaling, evaluation, far_away, hop, policy, report, rtt, scaling, throughput
+from benchmarks import autoscaling, evaluation, far_away, hop, policy, report, rtt, scaling, success, throughput
 from benchmarks.checkpoints import __main__ as checkpoints
 
 
@@ -32,6 +32,7 @@ from benchmarks.checkpoints import __main__ as checkpoints
         (rtt, ["--transports", "smoke"], "smoke"),
         (scaling, ["--workers", "2,4"], "from 1 on"),
         (scaling, ["--nodes", "none"], "--nodes"),
+        (success, ["--only", "again;faster"], "faster"),
         (throughput, ["--clients", "few"], "few"),
         (throughput, ["--set", "base_ms=1"], "--policy"),
     ],
