@@ -49,7 +49,8 @@ failed were left out.
 
 - {steps} steps of {batch} frames out of {trained_frames}; seed {seed}; {threads} threads, {processor}, torch {torch}.
 - {millions:.1f} million parameters in float32, `model.safetensors`; sizes, words and robots are in `config.json`.
-- Code: commit {commit}. `make reference` does all of it again, and ends with the same weights on the same processor.
+- Code: commit {commit}.
+- `make reference` does all of it again, and ends with the same weights on the same processor.
 
 ## Limits
 
@@ -62,14 +63,12 @@ MADE = "training.json"
 
 def rates(results: Sequence[Results]) -> list[str]:
     """Return the rows of the table of rates, a task each; `misled` is the control, told of other things."""
+    cells = {(cell.policy, cell.env): cell for one in results for cell in one.cells}
     lines = ["| task | success, % | misled, % | seeds |", "|---|---|---|---|"]
-    for one in results:
-        tasks = dict.fromkeys(cell.env for cell in one.cells)
-        for env in tasks:
-            by_policy = {cell.policy: cell for cell in one.cells if cell.env == env}
-            seeds = sorted(result.key.seed for result in by_policy["reference"].counted)
-            said = " | ".join(_rate([by_policy[name]]) for name in ("reference", "misled"))
-            lines.append(f"| `{env}` | {said} | {seeds[0]} to {seeds[-1]} |")
+    for (policy, env), cell in cells.items():
+        if policy == "reference":
+            last = max(one.key.seed for one in cell.counted)
+            lines.append(f"| `{env}` | {_rate([cell])} | {_rate([cells['misled', env]])} | 0 to {last} |")
     return lines
 
 
@@ -100,7 +99,7 @@ def main(checkpoint: Path, evaluations: list[Path]) -> None:
     for cell in (cell for one in results for cell in one.cells if cell.policy == "reference"):
         rate = rate_of([cell], "success_once")
         solved.setdefault(cell.env.partition("/")[0], {})[cell.env] = rate.successes, rate.episodes
-    (checkpoint / "rates.json").write_text(json.dumps(solved, indent=1) + "\n")
+    (checkpoint / "rates.json").write_text(json.dumps(solved) + "\n")
 
 
 if __name__ == "__main__":

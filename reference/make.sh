@@ -16,8 +16,9 @@ done
 [ -d "$runs/checkpoint" ] ||
   "$bin/python" reference/train.py "$runs/data" "$runs/checkpoint" --work "$runs/train" --every 2 \
     --cameras tabletop=front,wrist --cameras metaworld=corner2,gripperPOV
-for robot in tabletop metaworld; do
-  "$bin/vlagents-ray" eval "reference/evaluations/$robot.yaml" --out "$runs/evaluations/$robot" --resume
-  "$bin/vlagents-ray" bundle "$runs/evaluations/$robot" --out "$runs/checkpoint/$robot.bundle.zip"
+evaluations=(tabletop tabletop_misled metaworld metaworld_misled)
+for name in "${evaluations[@]}"; do
+  "$bin/vlagents-ray" eval "reference/evaluations/$name.yaml" --out "$runs/evaluations/$name" --resume
+  "$bin/vlagents-ray" bundle "$runs/evaluations/$name" --out "$runs/checkpoint/$name.bundle.zip"
 done
-"$bin/python" reference/card.py "$runs/checkpoint" "$runs/evaluations/tabletop" "$runs/evaluations/metaworld"
+"$bin/python" reference/card.py "$runs/checkpoint" "${evaluations[@]/#/$runs/evaluations/}"

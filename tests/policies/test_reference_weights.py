@@ -54,9 +54,9 @@ def test_their_card_and_rates_are_those_of_their_bundles(tmp_path: Path) -> None
     spec.loader.exec_module(card)
     shutil.copytree(CHECKPOINT, tmp_path / "checkpoint")
     evaluations = []
-    for bundle in sorted(CHECKPOINT.glob("*.bundle.zip"), reverse=True):
-        into = tmp_path / bundle.name.partition(".")[0]
-        assert verify(bundle, replay=0, into=into).holds
+    for name in ("tabletop", "tabletop_misled", "metaworld", "metaworld_misled"):
+        into = tmp_path / name
+        assert verify(CHECKPOINT / f"{name}.bundle.zip", replay=0, into=into).holds
         evaluations.append(into)
     card.main(tmp_path / "checkpoint", evaluations)
     for name in ("README.md", "rates.json"):
