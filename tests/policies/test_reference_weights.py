@@ -6,6 +6,7 @@ import importlib.util
 import json
 import shutil
 import sys
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -16,13 +17,13 @@ from vlagents_ray.evaluate.bundle.verification import verify
 from vlagents_ray.evaluate.results.statistics import wilson
 from vlagents_ray.policies.reference import Reference
 
-pytest.importorskip("torch")
+torch = pytest.importorskip("torch")
 pytestmark = pytest.mark.torch
 
 ROOT = Path(__file__).parents[2]
 CHECKPOINT = ROOT / "reference/checkpoint"
 RATES = json.loads((CHECKPOINT / "rates.json").read_text())
-EPISODES = 30
+EPISODES = 20
 TASKS = [env for env, (solved, episodes) in RATES["tabletop"].items() if solved / episodes > 0.8]
 
 
@@ -31,6 +32,16 @@ def test_they_are_small_enough_for_a_repository() -> None:
     assert sum(file.stat().st_size for file in CHECKPOINT.iterdir()) < 25e6
 
 
+@pytest.fixture
+def one_thread() -> Iterator[None]:
+    """Lets torch compute with one thread: batches of one are too small to share, and other tests run beside."""
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    yield
+    torch.set_num_threads(threads)
+
+
+@pytest.mark.usefixtures("one_thread")
 @pytest.mark.parametrize("env", TASKS)
 def test_they_succeed_as_often_as_their_card_says(env: str, tmp_path: Path) -> None:
     solved, episodes = RATES["tabletop"][env]

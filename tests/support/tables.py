@@ -105,12 +105,12 @@ def rates() -> Iterator[str]:
 
 def ways() -> Iterator[str]:
     """Yield the rows of the ways of serving the reference policy."""
-    yield from ("| way | success, % | difference | p | equal | ms an act |", "|---|---|---|---|---|---|")
+    yield from ("| way | success, % | difference | p | equal |", "|---|---|---|---|---|")
     for row in WAYS:
         off, low, high = (f"{100 * value:+.1f}" for value in (row["difference"], *row["difference_95"]))
         equal = "all" if row["equal"] == row["episodes"] else row["equal"]
         rate = share(row["solved"], row["episodes"], 1)
-        yield f"| {row['way']} | {rate} | {off} [{low}, {high}] | {row['p_holm']:.2g} | {equal} | {row['act_ms']:.1f} |"
+        yield f"| {row['way']} | {rate} | {off} [{low}, {high}] | {row['p_holm']:.2g} | {equal} |"
 
 
 _RAPTOR = f"a recurrent policy for quadrotors by its authors' weights, in 58 lines | PyPI | {verified('RAPTOR')}"
