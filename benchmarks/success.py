@@ -210,28 +210,27 @@ class Players:
                 "gr00t": {"mapping": _GR00T, "port": ports["gr00t"]},
                 "vlagents": {"port": ports["vlagents"]},
             }
-            config, batch = (
-                self._config(Way(STANDARD)),
-                {"max_size": TOGETHER},
-            )  # one session acts alone: a batch of one
-            document = deployment("reference", config=config, batch=batch, dialects=dialects)
+            batch = {"max_size": TOGETHER}  # a session that acts alone is a batch of one
+            document = deployment("reference", config=self._config(Way(STANDARD)), batch=batch, dialects=dialects)
             document.applications[0].name = APP
             server = self._stack.enter_context(running_server(document, num_cpus=2))
             self._server = server.url.removeprefix("http://"), ports
         return self._server
 
+    def _weights(self) -> dict[str, np.ndarray]:
+        with (self._checkpoint / WEIGHTS).open("rb") as file:
+            return {name: np.array(value) for name, value in read_values(file).items()}
+
     def _push(self) -> None:
         """Push other weights, then those of the checkpoint."""
-        with (self._checkpoint / WEIGHTS).open("rb") as file:
-            values = {name: np.array(value) for name, value in read_values(file).items()}
+        values = self._weights()
         with Publisher(f"serve://{APP}") as learner:
             learner.push({name: -value for name, value in values.items()}, pin=True)
             learner.push(values, pin=True)
 
     def _low_rank(self) -> tuple[np.ndarray, np.ndarray]:
         """Return A (4, inputs) and B (outputs, 4), whose product has a hundredth of the norm of the layer's weights."""
-        with (self._checkpoint / WEIGHTS).open("rb") as file:
-            weight = np.array(read_values(file)[f"{_ADAPTED}.weight"])
+        weight = self._weights()[f"{_ADAPTED}.weight"]
         rng = np.random.default_rng(0)
         down, up = (rng.standard_normal(shape, np.float32) for shape in ((4, weight.shape[1]), (weight.shape[0], 4)))
         return down, up * np.float32(0.01 * np.linalg.norm(weight) / np.linalg.norm(up @ down))
@@ -251,9 +250,7 @@ class Players:
         folder = self._folder / "merged"
         folder.mkdir(parents=True, exist_ok=True)
         shutil.copy(self._checkpoint / CONFIG, folder)
-        down, up = self._low_rank()
-        with (self._checkpoint / WEIGHTS).open("rb") as file:
-            values = {name: np.array(value) for name, value in read_values(file).items()}
+        (down, up), values = self._low_rank(), self._weights()
         values[f"{_ADAPTED}.weight"] += up @ down
         with (folder / WEIGHTS).open("wb") as file:
             write_values(file, values)

@@ -59,7 +59,7 @@ def demo(out_dir: Annotated[Path, typer.Option("--out", help="Folder of the resu
             f"solves {100 * solved / episodes:.0f} % of {episodes} such episodes; its card is {rates.parent}/README.md"
         )
         out.print(f"The policy was learned from demonstrations, and {said}.")
-        policy = PolicyConfig(name="reference", source="deployments/reference.yaml", execute=4)
+        policy = PolicyConfig(name="reference", source="deployments/reference.yaml")
     tasks = ["tabletop/pick_place", "tabletop/slide", "tabletop/stack", "tabletop/lift"]
     suite = SuiteConfig(envs=tasks, env_options={"cameras": ["front", "wrist"], "width": 64, "height": 64}, episodes=5)
     with errors():
