@@ -238,7 +238,7 @@ def deploy(client: Any, config: ServeDeploySchema, *, own: bool, ingress: bool) 
     """
     from ray import serve
 
-    from vlagents_ray.serve.replica.app import build
+    from vlagents_ray.serve.app import application
 
     stated = [app.model_dump(exclude_defaults=True).keys() for app in config.applications]
     ours = len(our_apps(config)) == len(config.applications)
@@ -247,7 +247,7 @@ def deploy(client: Any, config: ServeDeploySchema, *, own: bool, ingress: bool) 
         client.deploy_apps(config)
         return
     targets = [
-        serve.RunTarget(build(ServerArgs(**app.args), drains=ingress), name=app.name, route_prefix=app.route_prefix)
+        serve.RunTarget(application(ServerArgs(**app.args), drains=ingress), app.name, app.route_prefix)
         for app in config.applications
     ]
     serve.run_many(targets, wait_for_ingress_deployment_creation=False, wait_for_applications_running=False)
