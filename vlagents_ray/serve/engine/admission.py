@@ -202,11 +202,6 @@ class MessageAdmission(Budget):
                 pass
         return await asyncio.wrap_future(self.decode_on_thread(read))
 
-    @property
-    def holds(self) -> bool:
-        """Whether the message counts as in flight."""
-        return self._held > 0
-
     def release(self) -> None:
         """Release the bytes of a message that is answered or dropped."""
         held, self._held, self._decoded = self._held, 0, 0

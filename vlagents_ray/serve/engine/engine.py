@@ -96,7 +96,10 @@ class Engine:
         self._source = agent if isinstance(agent, Checkpoints) else Checkpoints(lambda _: agent)
         self.clock, self.finder = clock, finder
         self.sessions: SessionTable[LoadedModel] = SessionTable(
-            session_limit, session_idle_s, wall_clock, self._session_ended
+            session_limit,
+            session_idle_s,
+            wall_clock,
+            lambda session: self.models.release(session),  # noqa: PLW0108
         )
         self.calls, self.pauses = PolicyCalls(limits, clock), PauseDetector(clock)
         loader = Loader(self._source, version, batch_sizes, max_batch_size, check, self.calls)
@@ -122,7 +125,7 @@ class Engine:
         )
         self._thread = threading.Thread(target=self._serve, name="policy", daemon=True)
         self._started = threading.Event()  # set when loading the policy has succeeded or failed
-        self._alive = False  # whether a thread takes batches from the queue
+        self.alive = False  # whether a thread takes batches from the queue
         self._unsent: list[tuple[PendingRequest, Reply]] = []  # sent by another thread while the next batch runs
         self._answers = ThreadPoolExecutor(1, "policy-answers")
         self._acting = threading.Lock()  # held while the policy's thread runs a batch, and while the policy sleeps
@@ -140,7 +143,7 @@ class Engine:
             PolicyFailed: The policy does not load, or not within the time limit.
         """
         try:
-            self._alive = True
+            self.alive = True
             if threaded:
                 self._thread.start()
                 if not self._started.wait(limit_s := self.calls.limits.load_s):
@@ -166,7 +169,7 @@ class Engine:
             self.models.start()
         except BaseException as error:  # noqa: BLE001 - raised again by start(), on the caller's thread
             self._not_started = error
-            self._alive = False
+            self.alive = False
             self.queue.release()
             return
         finally:
@@ -191,7 +194,7 @@ class Engine:
             self._answers.shutdown()
             self.queue.release()
         finally:
-            self._alive = False
+            self.alive = False
 
     @property
     def ready(self) -> bool:
@@ -206,7 +209,7 @@ class Engine:
         """Raise `PolicyUnavailable` while the policy loads, `PolicyFailed` if it did not load or its thread ended."""
         if self._unready is not None:
             raise self.models.loading() if self._unready is self._loading else self._unready
-        if not self._alive:
+        if not self.alive:
             raise PolicyFailed("the policy's thread has ended")
         if self.calls.broken is not None:
             self.calls.require_device()
@@ -274,11 +277,6 @@ class Engine:
             self.queue.release()
         elif self._thread is not threading.current_thread():
             self._thread.join(timeout_s)
-
-    @property
-    def alive(self) -> bool:
-        """Whether the policy's thread takes requests."""
-        return self._alive
 
     @property
     def contract(self) -> Contract | None:
@@ -379,9 +377,6 @@ class Engine:
             pending.fail(PolicyUnavailable("the replica is stopping; connect again, or send the same request again"))
             return True
         return False
-
-    def _session_ended(self, session: Session[LoadedModel]) -> None:
-        self.models.release(session)
 
     def run(self, taken: Taken) -> None:
         """Answer the expired requests, and run the batch. Called on the policy's thread."""

@@ -20,9 +20,7 @@ class SessionTransfer:
         self, sessions: SessionTable[LoadedModel], models: ModelManager, require_ready: Callable[[], None]
     ) -> None:
         """Transfer the `sessions` of one engine; `require_ready` raises an error while the policy cannot act."""
-        self._sessions = sessions
-        self._models = models
-        self._require_ready = require_ready
+        self._sessions, self._models, self._require_ready = sessions, models, require_ready
 
     def adopt(self, session_id: str, state: dict[str, Any], timeout_s: float = 0.0) -> None:
         """Continue a session that another replica has released.
@@ -39,7 +37,7 @@ class SessionTransfer:
         self.enter(self.prepare(session_id, state, timeout_s))
 
     def prepare(self, session_id: str, state: dict[str, Any], timeout_s: float = 0.0) -> Session[LoadedModel]:
-        """Create a copy of the session that cannot act before `enter`; call `discard` if it is not needed."""
+        """Create a copy of the session that cannot act before `enter`; if it is not needed, release its model."""
         self._require_ready()
         self._sessions.require_room(session_id)
         arriving: Session[LoadedModel] = Session(
@@ -55,7 +53,7 @@ class SessionTransfer:
             arriving.weights = model.parameters.find(*state["parameters"])
             arriving.follows, arriving.instruction = state["follows"], state["instruction"]
         except BaseException:
-            self.discard(arriving)
+            self._models.release(arriving)
             raise
         return arriving
 
@@ -64,18 +62,13 @@ class SessionTransfer:
         try:
             self._sessions.enter(arriving)
         except BaseException:
-            self.discard(arriving)
+            self._models.release(arriving)
             raise
-
-    def discard(self, arriving: Session[LoadedModel]) -> None:
-        """Discard a prepared session, and release its model."""
-        self._models.release(arriving)
 
     def export(self, session_id: str) -> dict[str, Any]:
         """Return the state that another replica needs to continue the session after its release here."""
         session = self._sessions.get(session_id)
-        model = session.model
-        weights = session.weights
+        model, weights = session.model, session.weights
         if session.agent is None or model is None or weights is None:
             raise UnknownSession(f"session {session_id!r}: not reset yet")
         with model.call("export"):

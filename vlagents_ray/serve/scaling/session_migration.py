@@ -32,6 +32,7 @@ from typing import Any, Concatenate, ParamSpec, TypeVar
 from vlagents_ray.errors import VLAgentsError
 from vlagents_ray.protocol.messages import Op, Reply, Request
 from vlagents_ray.serve.engine.engine import Engine
+from vlagents_ray.serve.engine.sender import settle
 from vlagents_ray.serve.requests import PendingRequest
 from vlagents_ray.serve.sessions import Outdated, Version
 
@@ -182,11 +183,7 @@ class HeldSessions:
         If the request has not begun after `timeout_s`, it is withdrawn, and has no effect.
         """
         answered: asyncio.Future[Reply] = self._loop.create_future()
-
-        def done(reply: Reply) -> None:
-            self._loop.call_soon_threadsafe(_settle, answered, reply)
-
-        pending = PendingRequest(session_id, Request(op, kwargs=kwargs), done)
+        pending = PendingRequest(session_id, Request(op, kwargs=kwargs), partial(settle, answered))
         self._engine.submit([pending])
         await asyncio.wait([answered], timeout=timeout_s)
         if not answered.done():
@@ -214,11 +211,6 @@ class Peer(ABC):
         self, method: Callable[Concatenate[HeldSessions, P], Awaitable[T]], *args: P.args, **kwargs: P.kwargs
     ) -> T:
         """Call `method`, at the other replica, and return its result."""
-
-
-def _settle(answered: asyncio.Future[Reply], reply: Reply) -> None:
-    if not answered.done():
-        answered.set_result(reply)
 
 
 Peers = Callable[[], Awaitable[Sequence[Peer]]]
@@ -373,7 +365,7 @@ class SessionMigrator:
             if await self._query_peer(peer, []) is None:  # the replica hangs: only the copy waits for it
                 self._finish(session_id)
         if not release.result():
-            self._engine.transfer.discard(arriving)
+            self._engine.models.release(arriving)
             return False
         self._engine.transfer.enter(arriving)
         logger.info(
