@@ -169,7 +169,7 @@ class KeyedReplica:
         self.engine.start()
         routes = dialect_routes(DialectArgs(**ALL), ReplicaContext(self.engine, lambda: METADATA, LIMITS))
         metadata = METADATA | {"policy_version": None, "weights": None}
-        view = ReplicaView(self.engine, self.engine.observers, "this", "here", lambda: metadata)
+        view = ReplicaView(self.engine, "this", "here", lambda: metadata)
         live = live_routes(Fleet(view), open_to_network=False)
         others = [*weights_routes(_Receiving(self), 30.0, open_to_network=False), *live]
         inside = build_http_app(self.engine, lambda: METADATA, LIMITS, dialects=routes, others=others)

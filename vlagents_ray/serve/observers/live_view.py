@@ -22,7 +22,6 @@ from vlagents_ray.protocol.json_messages import plain_values
 from vlagents_ray.serve.config.deployment import LiveArgs
 from vlagents_ray.serve.engine.engine import Engine
 from vlagents_ray.serve.engine.metrics_buffer import SAMPLE, STAGES
-from vlagents_ray.serve.engine.observer import Observers
 from vlagents_ray.serve.models.loaded_model import LoadedModel
 from vlagents_ray.serve.observers.commands import TRACKED_S, CommandBoard
 from vlagents_ray.serve.observers.live import (
@@ -64,27 +63,20 @@ class ReplicaView:
     def __init__(
         self,
         engine: Engine,
-        observers: Observers,
         name: str,
         node: str,
         metadata: Callable[[], Mapping[str, Any]],
         settings: LiveArgs | None = None,
     ) -> None:
-        """Create the view of a replica.
+        """Create the view of a replica, `name` on `node`; `metadata` returns the metadata of its policy.
 
-        Args:
-            engine: The engine of the replica.
-            observers: The engine's observers.
-            name: The name of the replica.
-            node: The name of its node.
-            metadata: Returns the metadata of the policy.
-            settings: Settings for keeping the last seconds of each session, from `open` on; None keeps none.
+        `settings` are for keeping the last seconds of each session, from `open` on; None keeps none.
         """
         self._engine = engine
         self._about = {"name": name, "node": node, "ring_s": None if settings is None else settings.ring_s}
         self._metadata = metadata
         self.commands = CommandBoard(engine.sessions, self._save)
-        self.live = LiveObserver(observers, self.commands)
+        self.live = LiveObserver(engine.observers, self.commands)
         self.ring = None if settings is None else Ring(self.live, engine.sessions, settings, name)
         self._meter = LoadMeter(engine.queue)
         self._slow: dict[str, Any] = {}
@@ -355,7 +347,7 @@ class Fleet:
         shown = frozenset[str]().union(*(viewer.shown for viewer in self._viewers))
         readers: dict[str, SnapshotReader] = {} if self._others is None else dict(await self._others.views())
         if self._own is not None:
-            readers[""] = partial(_read_own, self._own)
+            readers[""] = partial(asyncio.to_thread, self._own.read)
         results = await asyncio.gather(
             *(read(self._read.get(name, 0), shown) for name, read in readers.items()), return_exceptions=True
         )
@@ -364,10 +356,6 @@ class Fleet:
         if self._own is not None and isinstance(error := results[-1], BaseException):
             raise error
         return list(found.values())
-
-
-async def _read_own(own: ReplicaView, since: int, shown: Collection[str]) -> Snapshot:
-    return await asyncio.to_thread(own.read, since, shown)
 
 
 def _with_files(snapshot: Snapshot, files: list[bytes], shown: Collection[str]) -> dict[str, Any]:

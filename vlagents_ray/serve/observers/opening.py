@@ -50,7 +50,7 @@ def open_observers(
             opened.callback(observers.remove, observer)
             observers.add(observer)
 
-        view = ReplicaView(engine, observers, name, node, metadata, args.live)
+        view = ReplicaView(engine, name, node, metadata, args.live)
         view.open()
         opened.callback(view.close)
         if (tracer := tracing.tracer()) is not None:

@@ -92,10 +92,6 @@ class _Sibling(Peer):
             raise PeerUnreachable(str(error)) from error
         return found
 
-    async def weights(self, method: Callable[..., T], *args: Any) -> T:
-        found: T = await self.call(method, *args)
-        return found
-
     async def call(self, method: Callable[..., Any], *args: Any) -> Any:
         """Call one of `PEER_METHODS`; raise `PeerEnded`, `PeerUnreachable` or the method's own errors."""
         limit_s = PEER_METHODS[method.__qualname__].limit_s
@@ -108,6 +104,8 @@ class _Sibling(Peer):
             raise error.cause if isinstance(error.cause, VLAgentsError) else PeerUnreachable(str(error)) from error
         except (ray.exceptions.RayError, TimeoutError, asyncio.TimeoutError) as error:  # or the network is partitioned
             raise PeerUnreachable(str(error) or f"no answer within {limit_s} s") from error
+
+    weights = call
 
 
 class ReplicasInCluster(OtherReplicas):

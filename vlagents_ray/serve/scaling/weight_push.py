@@ -34,10 +34,7 @@ _ATTEMPTS = 3  # attempts to commit at a replica that cannot be reached
 class WeightsReplica(Protocol):
     """A replica's interface for a push."""
 
-    @property
-    def name(self) -> str:
-        """Name of the replica, for messages."""
-        ...
+    name: str  # for messages
 
     async def weights(self, method: Callable[..., T], *args: Any) -> T:
         """Call a method of the replica's `WeightUpdates`; also raise `PeerEnded` and `PeerUnreachable`."""
@@ -49,12 +46,8 @@ class ThisReplica(WeightsReplica):
 
     def __init__(self, name: str, updates: WeightUpdates) -> None:
         """Set the updates of this replica's engine."""
-        self._name = name
+        self.name = name
         self._updates = updates
-
-    @property
-    def name(self) -> str:
-        return self._name
 
     async def weights(self, method: Callable[..., T], *args: Any) -> T:
         """Call the method on another thread, since it may be slow."""
