@@ -169,7 +169,7 @@ class Server:
             self._start()
             engine = self.engines[number]
             routes = dialect_routes(DialectArgs(**self._dialects), ReplicaContext(engine, lambda: METADATA, LIMITS))
-            app = build_http_app(engine, lambda: METADATA, LIMITS, dialects=routes)
+            app = build_http_app(engine, lambda: METADATA, LIMITS, more=routes)
             self._ports[number] = self._stack.enter_context(served(AccessMiddleware(app, None, "app")))
         return self._ports[number]
 

@@ -172,7 +172,7 @@ class KeyedReplica:
         view = ReplicaView(self.engine, "this", "here", lambda: metadata)
         live = live_routes(Fleet(view), open_to_network=False)
         others = [*weights_routes(_Receiving(self), 30.0, open_to_network=False), *live]
-        inside = build_http_app(self.engine, lambda: METADATA, LIMITS, dialects=routes, others=others)
+        inside = build_http_app(self.engine, lambda: METADATA, LIMITS, more=[*routes, *others])
         self.routes = inside.routes
         self.port = stack.enter_context(served(AccessMiddleware(inside, self.known.keys, "app")))
         check = partial(self.at_gateway.check, app="app")

@@ -48,7 +48,7 @@ def serving(
 def client_of(engine: Engine, dialects: dict[str, Any], keys: Keys | None = None) -> TestClient:
     """A client of the dialects over an engine."""
     routes = dialect_routes(DialectArgs(**dialects), ReplicaContext(engine, lambda: METADATA, LIMITS))
-    inside = build_http_app(engine, lambda: METADATA, LIMITS, dialects=routes)
+    inside = build_http_app(engine, lambda: METADATA, LIMITS, more=routes)
     return TestClient(AccessMiddleware(inside, keys, "app"))
 
 

@@ -78,9 +78,7 @@ def serve() -> None:
     own.open(), near.open()
     engine.start()
     routes = dialect_routes(DialectArgs(**ALL), ReplicaContext(engine, lambda: METADATA, limits))
-    with served(
-        AccessMiddleware(build_http_app(engine, lambda: METADATA, limits, dialects=routes), keys, "app")
-    ) as port:
+    with served(AccessMiddleware(build_http_app(engine, lambda: METADATA, limits, more=routes), keys, "app")) as port:
         found = {"port": port, "own": [own.address.port, own.path], "local": asdict(near.address)}
         print(json.dumps(found), flush=True)
         sys.stdin.read()

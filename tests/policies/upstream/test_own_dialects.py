@@ -42,7 +42,7 @@ def port() -> Iterator[int]:
     engine = Engine(Mirror(chunk=2))
     engine.start()
     routes = dialect_routes(DialectArgs(**DIALECTS), ReplicaContext(engine, lambda: METADATA, DEFAULT_LIMITS))
-    app = build_http_app(engine, lambda: METADATA, DEFAULT_LIMITS, dialects=routes)
+    app = build_http_app(engine, lambda: METADATA, DEFAULT_LIMITS, more=routes)
     with served(AccessMiddleware(app, None, "app")) as found:
         yield found
     engine.close()

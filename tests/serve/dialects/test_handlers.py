@@ -84,9 +84,7 @@ def test_dialects_count_in_the_statistics_by_their_names() -> None:
 
 def test_until_the_policy_is_loaded_every_dialect_answers_503() -> None:
     context = ReplicaContext(Engine(Mirror()), lambda: METADATA, LIMITS)
-    inside = build_http_app(
-        context.engine, lambda: METADATA, LIMITS, dialects=dialect_routes(DialectArgs(**ALL), context)
-    )
+    inside = build_http_app(context.engine, lambda: METADATA, LIMITS, more=dialect_routes(DialectArgs(**ALL), context))
     with TestClient(AccessMiddleware(inside, None, "app")) as client:
         assert client.get("/health").status_code == 503
         assert client.post("/act", json=body(1)).status_code == 503

@@ -68,6 +68,7 @@ from vlagents_ray.serve.endpoints.http_messages import (
     LONG_BYTES,
     RequestDecoder,
     problem_response,
+    public_problem,
     request_id,
     session_id,
 )
@@ -272,14 +273,6 @@ async def decoded(read: Callable[[bytes, Budget], T], data: bytes | None, admiss
         raise MalformedMessage("message: got text, want a binary map")
     admission.begin("act")
     return await admission.decoded(partial(read, data), long=len(data) > LONG_BYTES)
-
-
-def public_problem(error: Exception, what: str, request_id: str) -> VLAgentsError:
-    """Return the error that a client may see; details of an unexpected error are only logged."""
-    if isinstance(error, VLAgentsError):
-        return error
-    logger.error("%s failed (request %s)", what, request_id, exc_info=error)
-    return VLAgentsError("internal error; the server's log has the details")
 
 
 async def accept_or_refuse(websocket: WebSocket, context: ReplicaContext) -> bool:

@@ -37,8 +37,8 @@ from vlagents_ray.serve.dialects.base import (
     accept_or_refuse,
     act_together,
     decoded,
-    public_problem,
 )
+from vlagents_ray.serve.endpoints.http_messages import public_problem
 from vlagents_ray.serve.engine.admission import MessageAdmission
 from vlagents_ray.serve.engine.sender import REFUSED, Sender
 from vlagents_ray.serve.requests import Message

@@ -32,9 +32,8 @@ from vlagents_ray.serve.dialects.base import (
     Stream,
     accept_or_refuse,
     decoded,
-    public_problem,
 )
-from vlagents_ray.serve.endpoints.http_messages import problem_response
+from vlagents_ray.serve.endpoints.http_messages import problem_response, public_problem
 from vlagents_ray.serve.engine.admission import MessageAdmission
 from vlagents_ray.serve.engine.sender import REFUSED, Sender
 from vlagents_ray.wire import vla_eval

@@ -203,13 +203,13 @@ class PolicyReplica(ClientApi, SiblingApi):
 
     def __serve_build_asgi_app__(self) -> ASGIApp:
         slow_s, idle_s = self._args.limits.slow_s, self._args.sessions.idle_s
-        dialects = dialect_routes(self._args.dialects, ReplicaContext(self._engine, self.metadata, self._limits))
         insecure, hosts = self._args.access.insecure, self._args.access.hosts
-        others = [
+        more = [
+            *dialect_routes(self._args.dialects, ReplicaContext(self._engine, self.metadata, self._limits)),
             *weights_routes(self, slow_s, open_to_network=insecure),
             *live_routes(self._fleet, open_to_network=insecure),
         ]
-        inside = build_http_app(self._engine, self.metadata, self._limits, self._metadata_for_machine, dialects, others)
+        inside = build_http_app(self._engine, self.metadata, self._limits, self._metadata_for_machine, more)
         return AccessMiddleware(inside, self._keys, self._app, slow_s=slow_s, idle_s=idle_s, hosts=hosts)
 
     def _admit(self) -> Admit | NoKey:
