@@ -32,7 +32,6 @@ from vlagents_ray.serve.engine.metrics_buffer import MetricsBuffer
 from vlagents_ray.serve.engine.observer import Observers
 from vlagents_ray.serve.engine.pauses import PauseDetector
 from vlagents_ray.serve.engine.responses import build_reply, public_error, raised_at, require_serializable, timing
-from vlagents_ray.serve.engine.session_transfer import SessionTransfer
 from vlagents_ray.serve.models.checkpoints import Checkpoints
 from vlagents_ray.serve.models.loaded_model import LoadedModel, Loader
 from vlagents_ray.serve.models.model_manager import ModelManager, too_late
@@ -40,7 +39,7 @@ from vlagents_ray.serve.queue.batch_queue import BatchQueue, Taken
 from vlagents_ray.serve.queue.call_limits import CallLimits, PolicyCall, PolicyCalls
 from vlagents_ray.serve.queue.poller import Poller
 from vlagents_ray.serve.queue.preparation import Preparations
-from vlagents_ray.serve.requests import Opening, PendingRequest, Rank
+from vlagents_ray.serve.requests import CheckpointChoice, Opening, PendingRequest, Rank
 from vlagents_ray.serve.sessions import DrainList, Session, SessionFinder, SessionTable
 from vlagents_ray.serve.weights import Rest, WeightsVersion, WeightUpdates, follows
 
@@ -130,7 +129,7 @@ class Engine:
         self._answers = ThreadPoolExecutor(1, "policy-answers")
         self._acting = threading.Lock()  # held while the policy's thread runs a batch, and while the policy sleeps
         self.weights = WeightUpdates(lambda: self.models.own_weights, self.sessions.all, self._acting)
-        self.transfer = SessionTransfer(self.sessions, self.models, self.require_ready)
+
         self.observers = Observers()
 
     def start(self, *, threaded: bool = True) -> None:
@@ -500,11 +499,11 @@ class Engine:
         """Run a request that is neither an act nor a reset, and return the info of its answer."""
         session_id, request = pending.session_id, pending.request
         if request.op == "export":
-            return self.transfer.export(session_id)
+            return self.export(session_id)
         if request.op == "release":
             return {"released": self.sessions.release(session_id, request.kwargs["version"])}
         if request.op == "adopt":
-            self.transfer.adopt(session_id, request.kwargs)
+            self.adopt(session_id, request.kwargs)
         elif request.op == "observe":
             self._observe(pending)
         elif request.op == "weights":
@@ -601,6 +600,72 @@ class Engine:
         if unsent:
             self._unsent.extend(unsent)
         self.stats.batch(len(acting), rows)
+
+    # Sessions that move between replicas: their state is bytes and settings.
+
+    def export(self, session_id: str) -> dict[str, Any]:
+        """Return the state that another replica needs to continue the session after its release here."""
+        session = self.sessions.get(session_id)
+        model, weights = session.model, session.weights
+        if session.agent is None or model is None or weights is None:
+            raise UnknownSession(f"session {session_id!r}: not reset yet")
+        with model.call("export"):
+            agent = model.copies.dump(session.agent)
+        return {
+            "agent": agent,
+            "steps": session.steps,
+            "first": session.first,
+            "moves": session.moves,
+            "version": list(model.version),
+            "choice": [model.choice.name, model.choice.step],
+            "settings": model.settings,
+            "parameters": [weights.number, weights.fingerprint],
+            "follows": session.follows,
+            "instruction": session.instruction,
+        }
+
+    def adopt(self, session_id: str, state: dict[str, Any], timeout_s: float = 0.0) -> None:
+        """Continue a session that another replica has released.
+
+        Args:
+            session_id: Id of the session.
+            state: The `info` of the other replica's reply to "export".
+            timeout_s: Maximum time for loading the session's checkpoint, s; 0 if it must be loaded already.
+
+        Raises:
+            UnknownSession: The session has, or had, a newer state here, has begun a reset, or needs a checkpoint or a
+                version of the policy that is not available here.
+        """
+        self.enter(self.prepare_adoption(session_id, state, timeout_s))
+
+    def prepare_adoption(self, session_id: str, state: dict[str, Any], timeout_s: float = 0.0) -> Session[LoadedModel]:
+        """Create a copy of the session that cannot act before `enter`; if it is not needed, release its model."""
+        self.require_ready()
+        self.sessions.require_room(session_id)
+        first, moves = state["first"], state["moves"] + 1
+        arriving: Session[LoadedModel] = Session(
+            session_id, steps=state["steps"], first=first, expected=first, moves=moves, announced=True
+        )
+        try:
+            model = self.models.adopt(arriving, CheckpointChoice(*state["choice"]), state["settings"], timeout_s)
+            if tuple(state["version"]) != model.version:
+                raise UnknownSession(f"session {session_id!r}: of another version of the policy; reset it")
+            with model.call("adopt", threading.get_ident()):
+                arriving.agent = model.copies.load(state["agent"])
+            arriving.weights = model.parameters.find(*state["parameters"])
+            arriving.follows, arriving.instruction = state["follows"], state["instruction"]
+        except BaseException:
+            self.models.release(arriving)
+            raise
+        return arriving
+
+    def enter(self, arriving: Session[LoadedModel]) -> None:
+        """Add a prepared session to the table, so that it acts here from now on."""
+        try:
+            self.sessions.enter(arriving)
+        except BaseException:
+            self.models.release(arriving)
+            raise
 
 
 def _send(answers: Sequence[tuple[PendingRequest, Reply]]) -> None:

@@ -133,7 +133,7 @@ class HeldSessions:
         if self._engine.draining:
             return False
         try:
-            await self._in_thread(self._engine.transfer.adopt, session_id, state)
+            await self._in_thread(self._engine.adopt, session_id, state)
         except Outdated:  # the call is a repetition, or a newer state arrived first
             return True
         except VLAgentsError as error:
@@ -358,7 +358,7 @@ class SessionMigrator:
         state = await self._answer(peer.ask(HeldSessions.copy, session_id), EXPORT_S)
         if state is None:
             return False
-        arriving = await self._in_thread(self._engine.transfer.prepare, session_id, state, _LOAD_S)
+        arriving = await self._in_thread(self._engine.prepare_adoption, session_id, state, _LOAD_S)
         version = state["steps"], state["moves"]
         release = self._spawn(self._answer(peer.ask(HeldSessions.release, session_id, version, uuid.uuid4().hex)))
         while not (await asyncio.wait([release], timeout=_ANSWER_S))[0]:
@@ -367,7 +367,7 @@ class SessionMigrator:
         if not release.result():
             self._engine.models.release(arriving)
             return False
-        self._engine.transfer.enter(arriving)
+        self._engine.enter(arriving)
         logger.info(
             "session %s: fetched from another replica, after %d acts", session_id, state["steps"] - state["first"]
         )
