@@ -18,13 +18,7 @@ from typing import Any
 from urllib.parse import urlsplit
 
 from vlagents_ray.errors import ClusterLost, ConfigError
-from vlagents_ray.ray_tools.private import (
-    START_LOGGER,
-    address_of_ray_start,
-    node_of_this_process,
-    node_that_failed,
-    start_head,
-)
+from vlagents_ray.ray_tools import private
 from vlagents_ray.ray_tools.reaper import MARK, reaped
 from vlagents_ray.ray_tools.signals import own_sigterm
 
@@ -101,7 +95,7 @@ def _local_server(address: str | None) -> str | None:
     if address != "auto":
         return None
     # If there is no cluster of `ray start`, Ray would try that of a server on this machine, and wait for ten minutes.
-    return "" if address_of_ray_start() is None and local_servers() else None
+    return "" if private.address_of_ray_start() is None and local_servers() else None
 
 
 @contextlib.contextmanager
@@ -166,10 +160,10 @@ def start_ray(folder: Path, **options: Any) -> None:
         node = None
         try:
             with own_sigterm(), _taken_port() as port:
-                node = start_head(str(folder / FILES), port, _system_config=_CONFIG, **resources)
+                node = private.start_head(str(folder / FILES), port, _system_config=_CONFIG, **resources)
                 ray.init(node.gcs_address, **({"log_to_driver": False} | options))
         except Exception as error:  # Ray raises a plain Exception
-            node = node or node_that_failed(error)
+            node = node or private.node_that_failed(error)
             if node is None or not node.all_processes:  # nothing was started, so time is not the cause
                 raise
             node.kill_all_processes(check_alive=False, wait=True)  # Ray does not end them itself
@@ -199,7 +193,7 @@ def leave_ray() -> None:
 
 def started_here() -> bool:
     """Return whether this process is in a cluster that it started itself."""
-    node = node_of_this_process()
+    node = private.node_of_this_process()
     return node is not None and any(one.gcs_address == node.gcs_address for one in _started)
 
 
@@ -216,7 +210,7 @@ def _taken_port() -> Iterator[int]:
         def is_shown(record: logging.LogRecord) -> bool:
             return f":{port} " not in record.getMessage()
 
-        logger = logging.getLogger(START_LOGGER)
+        logger = logging.getLogger(private.START_LOGGER)
         logger.addFilter(is_shown)
         try:
             with warnings.catch_warnings():
@@ -286,8 +280,6 @@ def join(server: str | None = None, **options: Any) -> LocalServer:
     """
     import ray
 
-    from vlagents_ray.ray_tools.private import reread_authentication_mode, use_loopback
-
     chosen, environment = _chosen(server)
     if ray.is_initialized():
         if ray.get_runtime_context().gcs_address == chosen.ray_address:
@@ -304,8 +296,8 @@ def join(server: str | None = None, **options: Any) -> LocalServer:
     for one in _TOKENS:
         os.environ.pop(one, None)
     os.environ.update({MODE: "token", ALONE: "0"} | tokens)
-    use_loopback(True)  # Ray has already read the variables, when it was imported
-    reread_authentication_mode()
+    private.use_loopback(True)  # Ray has already read the variables, when it was imported
+    private.reread_authentication_mode()
     ray.init(chosen.ray_address, **{"log_to_driver": True, "logging_level": "WARNING"} | options)
     return chosen
 

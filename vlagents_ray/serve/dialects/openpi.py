@@ -27,17 +27,7 @@ from starlette.websockets import WebSocket, WebSocketDisconnect
 from vlagents_ray.errors import MalformedMessage, TooManyRequests, VLAgentsError, shown
 from vlagents_ray.protocol.messages import Reply
 from vlagents_ray.serve.config.dialects import DialectConfig, MappingSetting
-from vlagents_ray.serve.dialects.base import (
-    INTERNAL_ERROR,
-    POLICY_VIOLATION,
-    ImplicitSession,
-    RouteDialect,
-    SessionObs,
-    Stream,
-    accept_or_refuse,
-    act_together,
-    decoded,
-)
+from vlagents_ray.serve.dialects import base
 from vlagents_ray.serve.endpoints.http_messages import public_problem
 from vlagents_ray.serve.engine.admission import MessageAdmission
 from vlagents_ray.serve.engine.sender import REFUSED, Sender
@@ -46,7 +36,7 @@ from vlagents_ray.wire import openpi
 from vlagents_ray.wire.openpi import PRESETS
 
 
-class MapDialect(RouteDialect):
+class MapDialect(base.RouteDialect):
     """A dialect whose messages are maps in openpi's encoding; all such dialects share the server's root."""
 
     root = "openpi"
@@ -55,7 +45,7 @@ class MapDialect(RouteDialect):
         """Serve one connection at this dialect's path."""
         await MapEndpoint([self]).stream(socket)
 
-    def at_root(self, sharing: Sequence[MapDialect]) -> Stream:
+    def at_root(self, sharing: Sequence[MapDialect]) -> base.Stream:
         return MapEndpoint(sharing).stream
 
     @abc.abstractmethod
@@ -158,9 +148,9 @@ class MapConnection:
     def __init__(self, dialect: MapDialect) -> None:
         self.dialect = dialect
         self.sender: Sender = dialect.sender()
-        self.session: ImplicitSession = dialect.session(self.sender)
+        self.session: base.ImplicitSession = dialect.session(self.sender)
         self.episode: str | None = None  # name of the episode, set by the client
-        self._batched: list[ImplicitSession] = []  # sessions by index in a batch
+        self._batched: list[base.ImplicitSession] = []  # sessions by index in a batch
         self._before_ms: float | None = None
 
     def end_episodes(self) -> None:
@@ -180,15 +170,15 @@ class MapConnection:
         sessions = [self.session] if batch is None else await self._of_batch(len(batch))
         if not sessions[0].episode.begun:
             dialect.mapping.warn_of_unread_cameras(observations[0], dialect.name)
-        seen = [SessionObs(session, *one) for session, one in zip(sessions, read, strict=True)]
+        seen = [base.SessionObs(session, *one) for session, one in zip(sessions, read, strict=True)]
         incoming.decoded_alike(len(observations))
-        replies = await act_together(incoming, seen, request_id)
+        replies = await base.act_together(incoming, seen, request_id)
         before_ms, batched = self._before_ms, batch is not None
         data = incoming.written(lambda: openpi.encode(dialect.answer(replies, before_ms, batched=batched)))
         self._before_ms = (time.perf_counter() - incoming.arrived) * 1e3
         return data
 
-    async def _of_batch(self, number: int) -> list[ImplicitSession]:
+    async def _of_batch(self, number: int) -> list[base.ImplicitSession]:
         """Return the sessions of a batch of that size, in order; a change of the size ends the episodes."""
         if number != len(self._batched):
             surplus, self._batched = self._batched[number:], self._batched[:number]
@@ -210,7 +200,7 @@ class MapEndpoint:
 
     async def stream(self, socket: WebSocket) -> None:
         """Serve one connection; its sessions end with it."""
-        if not await accept_or_refuse(socket, self._context):
+        if not await base.accept_or_refuse(socket, self._context):
             return
         connections: dict[str, MapConnection] = {}
         gate = self._dialects[0].gate()
@@ -236,7 +226,7 @@ class MapEndpoint:
         """Reply to one message; return False if the connection was closed."""
         incoming, request_id = self._dialects[0].arrived(), uuid.uuid4().hex
         try:
-            message = await decoded(lambda data, budget: openpi.decode(data, budget.limits), data, admission)
+            message = await base.decoded(lambda data, budget: openpi.decode(data, budget.limits), data, admission)
             dialect = next((dialect for dialect in self._dialects if dialect.speaks(message)), self._dialects[0])
             arrived, incoming = incoming.arrived, dialect.arrived()
             incoming.arrived = arrived
@@ -248,9 +238,9 @@ class MapEndpoint:
             await socket.send_text(f"{problem} (request {request_id})")
             if isinstance(problem, TooManyRequests):  # the connection stays open, as nothing was acted on
                 if gate.refused_too_often:
-                    await socket.close(POLICY_VIOLATION, REFUSED)
+                    await socket.close(base.POLICY_VIOLATION, REFUSED)
                 return not gate.refused_too_often
-            await socket.close(INTERNAL_ERROR, "Internal server error.")
+            await socket.close(base.INTERNAL_ERROR, "Internal server error.")
             return False
         finally:
             admission.release()

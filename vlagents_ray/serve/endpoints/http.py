@@ -28,20 +28,9 @@ from starlette.types import ASGIApp, Message, Receive, Scope, Send
 from starlette.websockets import WebSocket, WebSocketDisconnect
 
 from vlagents_ray.errors import MalformedMessage, PolicyUnavailable, UnknownApp, VLAgentsError
+from vlagents_ray.protocol import messages
 from vlagents_ray.protocol.frames import CONTENT_TYPE, decode_requests, encode_replies
 from vlagents_ray.protocol.json_messages import plain_values
-from vlagents_ray.protocol.messages import (
-    MACHINE_HEADER,
-    OPS,
-    RANK_HEADER,
-    STEP_HEADER,
-    Limits,
-    Op,
-    Reply,
-    is_probe,
-    probe_answer,
-    read_probe,
-)
 from vlagents_ray.serve.access.api_keys import current_caller
 from vlagents_ray.serve.endpoints.docs_page import STYLE, docs_page
 from vlagents_ray.serve.endpoints.http_messages import (
@@ -65,7 +54,7 @@ _HEALTH_S = 1.5  # `/healthz` replies within this time
 def build_http_app(
     engine: Engine,
     metadata: Callable[[], dict[str, Any]],
-    limits: Limits,
+    limits: messages.Limits,
     machine_metadata: Callable[[str], Awaitable[dict[str, Any]]] | None = None,
     more: Sequence[BaseRoute] = (),
 ) -> Starlette:
@@ -83,7 +72,7 @@ def build_http_app(
     server = _HttpEndpoint(engine, metadata, limits, machine_metadata)
     app = Starlette(
         routes=[
-            *(Route(f"/v1/{op}", server.endpoint(op), methods=["POST"]) for op in OPS),
+            *(Route(f"/v1/{op}", server.endpoint(op), methods=["POST"]) for op in messages.OPS),
             WebSocketRoute("/v1/stream", server.stream),
             Route("/v1/metadata", server.show_metadata),
             Route("/healthz", server.health),
@@ -102,7 +91,7 @@ class _HttpEndpoint:
         self,
         engine: Engine,
         metadata: Callable[[], dict[str, Any]],
-        limits: Limits,
+        limits: messages.Limits,
         machine_metadata: Callable[[str], Awaitable[dict[str, Any]]] | None,
     ) -> None:
         self._engine = engine
@@ -125,7 +114,7 @@ class _HttpEndpoint:
         return problem_response(unready, request_id(http))
 
     async def show_metadata(self, http: HttpRequest) -> Response:
-        machine = http.headers.get(MACHINE_HEADER)
+        machine = http.headers.get(messages.MACHINE_HEADER)
         if machine and self._machine_metadata is not None and self._engine.ready:
             return JSONResponse(plain_values(await self._machine_metadata(machine)))
         return self._when_ready(http, lambda: JSONResponse(plain_values(self._metadata())))
@@ -140,7 +129,7 @@ class _HttpEndpoint:
             return problem_response(error, request_id(http), 503)
         return answer()
 
-    def endpoint(self, op: Op) -> Callable[[HttpRequest], Awaitable[Response]]:
+    def endpoint(self, op: messages.Op) -> Callable[[HttpRequest], Awaitable[Response]]:
         """Return the handler of `POST /v1/<op>`."""
 
         async def handle(http: HttpRequest) -> Response:
@@ -148,7 +137,7 @@ class _HttpEndpoint:
             name, headers = request_id(http), headers_of(http.scope)
             try:
                 sender = Sender(self._engine, "http", session_id(http), caller=current_caller(), connected=False)
-                admission = sender.admission(self._limits, rank=headers.get(RANK_HEADER, "robot"))
+                admission = sender.admission(self._limits, rank=headers.get(messages.RANK_HEADER, "robot"))
                 decoded = await self._requests.read(op, _timed(http, incoming), admission, name)
                 incoming.decoded(decoded)
                 if decoded.requests:
@@ -158,7 +147,7 @@ class _HttpEndpoint:
                     raise error
                 if CONTENT_TYPE in headers.get("accept", "") or len(replies) > 1:
                     return Response(incoming.frame(), media_type=CONTENT_TYPE)
-                step = {} if replies[0].step is None else {STEP_HEADER: str(replies[0].step)}
+                step = {} if replies[0].step is None else {messages.STEP_HEADER: str(replies[0].step)}
                 return Response(incoming.document(), headers=step, media_type="application/json")
             except ClientDisconnect:
                 incoming.record_failure("disconnected")
@@ -175,7 +164,7 @@ class _HttpEndpoint:
         await socket.accept()
         if len(self._engine.sessions) >= self._engine.sessions.limit:
             full = self._engine.sessions.full()
-            await socket.send_bytes(encode_replies([Reply(error=full)]))
+            await socket.send_bytes(encode_replies([messages.Reply(error=full)]))
             await socket.close(_TRY_AGAIN_LATER, str(full)[:120])
             return
         sender = Sender(self._engine, "websocket", caller=current_caller())
@@ -194,12 +183,12 @@ class _HttpEndpoint:
 
     async def _answer(self, sender: Sender, frame: bytes | None) -> bytes:
         """Return the answer to a message of a WebSocket, a frame or a probe; None is a text message."""
-        if frame is not None and is_probe(frame):
+        if frame is not None and messages.is_probe(frame):
             try:
-                read_probe(frame, sender.admission(self._limits, len(frame), "simulation"))
-                return probe_answer(len(frame))
+                messages.read_probe(frame, sender.admission(self._limits, len(frame), "simulation"))
+                return messages.probe_answer(len(frame))
             except VLAgentsError as error:
-                return encode_replies([Reply(error=error)])
+                return encode_replies([messages.Reply(error=error)])
         incoming = sender.message()
         admission = sender.admission(self._limits, 0 if frame is None else len(frame))
         try:

@@ -32,16 +32,8 @@ from vlagents_ray.errors import (
     UnknownApp,
     VLAgentsError,
 )
+from vlagents_ray.protocol import messages
 from vlagents_ray.protocol.frames import Decoded, decode_requests
-from vlagents_ray.protocol.messages import (
-    STREAM_BYTES,
-    STREAM_PATH,
-    Limits,
-    StreamAddress,
-    is_probe,
-    probe_answer,
-    read_probe,
-)
 from vlagents_ray.serve.access.api_keys import Caller, Identity, NoKey, token_of
 from vlagents_ray.serve.access.origin_check import require_own_page
 from vlagents_ray.serve.endpoints.buffers import READ_BYTES, ReceiveBuffer, SendBuffer, receive
@@ -87,7 +79,7 @@ class WebSocketServer(PolledServer["WebSocketConnection"]):
     def __init__(
         self,
         engine: Engine,
-        limits: Limits,
+        limits: messages.Limits,
         host: str,
         ports: tuple[int, int] | None,
         admit: Admit | NoKey,
@@ -111,9 +103,9 @@ class WebSocketServer(PolledServer["WebSocketConnection"]):
         super().__init__(engine, limits, admit, _bind(host, ports))
         self.slow_s, self.idle_s = slow_s, idle_s
         self._hosts = hosts
-        self.path = STREAM_PATH + secrets.token_urlsafe(24)
+        self.path = messages.STREAM_PATH + secrets.token_urlsafe(24)
         self._handshaking: dict[WebSocketConnection, None] = {}  # before their handshake, in order of arrival
-        self.address = StreamAddress(self._listener.getsockname()[1], self.path)
+        self.address = messages.StreamAddress(self._listener.getsockname()[1], self.path)
 
     def open(self) -> None:
         """Accept clients; call this before the engine starts."""
@@ -174,11 +166,11 @@ class WebSocketConnection(PolledConnection):
         super().__init__(server, connection)
         self._server, self._limits = server, server.limits
         self._arrived = 0.0  # arrival time of the bytes read last, s
-        self._protocol = ServerProtocol(max_size=STREAM_BYTES)  # guarded by the lock
+        self._protocol = ServerProtocol(max_size=messages.STREAM_BYTES)  # guarded by the lock
         self._head = b""  # received part of the handshake
         self._refused_for_s = 0.0  # time after which the handshake is no longer over the rate of its key
         self._received = ReceiveBuffer()
-        self._out = SendBuffer(connection, self._sending, STREAM_BYTES)
+        self._out = SendBuffer(connection, self._sending, messages.STREAM_BYTES)
         self._paused = False  # whether too many messages are unanswered; guarded by the lock
         # Received but unprocessed frames, their arrival times, s, and the admissions of those received in parts.
         self._frames: deque[tuple[Frame, float, MessageAdmission | None]] = deque()
@@ -381,9 +373,9 @@ class WebSocketConnection(PolledConnection):
             if frame.opcode is Opcode.TEXT:
                 raise MalformedMessage("stream: got a text message, want a binary frame")
             data = bytes(frame.data)
-            if is_probe(data):
-                read_probe(data, admission)
-                self._send(probe_answer(len(data)))
+            if messages.is_probe(data):
+                messages.read_probe(data, admission)
+                self._send(messages.probe_answer(len(data)))
             else:
                 submit = partial(self._submit, sender, message, admission, len(data), arrived)
                 self._decode(message, partial(decode_requests, data), admission, submit)

@@ -22,28 +22,8 @@ from typing import Any
 from ray.serve.schema import ServeDeploySchema
 
 from vlagents_ray.errors import ConfigError, PolicyUnavailable
-from vlagents_ray.ray_tools.private import (
-    end_controller,
-    forget_serve,
-    gpus_here,
-    long_polls,
-    proxies_now,
-    start_serve,
-    use_loopback,
-)
+from vlagents_ray.ray_tools import private, session
 from vlagents_ray.ray_tools.reaper import MARK
-from vlagents_ray.ray_tools.session import (
-    ALONE,
-    MODE,
-    announce,
-    joined,
-    leave_ray,
-    ray_folder,
-    start_ray,
-    started_here,
-    unless_lost,
-    variables,
-)
 from vlagents_ray.serve.access.api_keys import require_access, warn_of_plain_http
 from vlagents_ray.serve.config.deployment import AccessArgs, ServerArgs
 from vlagents_ray.serve.launch.deployment_file import our_apps, with_gateways_at, with_replicas_on
@@ -101,16 +81,16 @@ def shut_down(client: Any) -> None:
 
     from vlagents_ray.ray_tools.head_monitor import head_is_gone
 
-    for poll in long_polls(client):  # Ray would report a call in progress at the controller's end as a failed task
+    for poll in private.long_polls(client):  # Ray would report a call in progress at the end as a failed task
         poll.stop()
     client.shutdown_cached_handles()
-    last = end_controller(client)
+    last = private.end_controller(client)
     deadline = time.monotonic() + _SHUTDOWN_S
     while not ray.wait([last], timeout=_LOOK_S)[0] and not head_is_gone():
         if time.monotonic() > deadline:
             log.warning("Serve has not ended within %g s and is left behind", _SHUTDOWN_S)
             break
-    forget_serve(client)
+    private.forget_serve(client)
 
 
 __all__ = ["Server", "deploy", "free_port", "running_server", "spread_over_gpus"]
@@ -178,19 +158,19 @@ def running_server(
 
     own = address is None and not ray.is_initialized()
     if own:
-        _require_gpus(config, gpus_here())
+        _require_gpus(config, private.gpus_here())
     with contextlib.ExitStack() as stack:
         ingress = ingress or not own or len(our_apps(config)) < len(config.applications)
         public = port or free_port(host)
         http = stack.enter_context(_ray(address, host, public, tls, num_cpus, ingress))
         location = "Disabled" if not ingress else "HeadOnly" if address is None else "EveryNode"
-        client, proxies = start_serve(http, location)
+        client, proxies = private.start_serve(http, location)
         if running := sorted(serve.status().applications):
             raise ConfigError(
                 f"Serve runs {running} on this cluster already; use their URL (serve://{running[0]} inside the "
                 f"cluster), or `serve deploy` one file that holds those and yours"
             )
-        stack.push(unless_lost(lambda: shut_down(client)))
+        stack.push(session.unless_lost(lambda: shut_down(client)))
         _require_gpus(config)
         remind = functools.partial(_missing_gpus, config)
         deploy(client, config, own=own, ingress=ingress)
@@ -203,12 +183,12 @@ def running_server(
         inside += f"://{LOOPBACK if http['host'] == EVERYWHERE else http['host']}:{http['port']}"
         ours = {app.name for app in our_apps(config)}
         urls = {name: inside + path if ingress else None for name, path in paths.items()}
-        wait_for_proxies(proxies, lambda: proxies_now(client))
+        wait_for_proxies(proxies, lambda: private.proxies_now(client))
         wait_until_ready(serve, urls, ours, deadline, remind)
         if ingress and address is None and (stats_port := os.environ.get("RAY_SERVE_HAPROXY_STATS_PORT")):
             wait_for_haproxy(serve, paths, int(stats_port), deadline)
         if own and ingress:
-            announce(url, paths, ray.get_runtime_context().gcs_address)
+            session.announce(url, paths, ray.get_runtime_context().gcs_address)
         yield Server(url, {name: url + path for name, path in paths.items()})
 
 
@@ -259,7 +239,7 @@ def _require_gpus(config: ServeDeploySchema, here: float | None = None) -> None:
     `here` is the number of GPUs that a new local Ray would have. An existing cluster may grow: there, missing GPUs
     cause a warning, which is repeated while the replicas wait.
     """
-    if here is None and not started_here():
+    if here is None and not session.started_here():
         return
     if (missing := _missing_gpus(config, here)) is not None:
         raise ConfigError(f"{missing}; where there are more, see `vlagents-ray doctor`")
@@ -273,7 +253,7 @@ def _missing_gpus(config: ServeDeploySchema, here: float | None = None) -> str |
     there = ray.cluster_resources().get("GPU", 0.0) if here is None else here
     if sum(wanted.values()) <= there:
         return None
-    where = "this machine" if here is not None or started_here() else "this cluster"
+    where = "this machine" if here is not None or session.started_here() else "this cluster"
     return (
         f"resources.num_gpus: the replicas of {wanted} need {sum(wanted.values()):g} GPUs, {where} has {there:g}; "
         f"want less (0 runs on the CPU), or add a machine that has them"
@@ -324,7 +304,7 @@ def _ray(
             f"host {host}: with HAProxy Serve would find no replica at a single address; "
             f"use {EVERYWHERE} (or {LOOPBACK}), or leave ray.init() to this function"
         )
-    with joined(address):
+    with session.joined(address):
         yield {"host": host, "port": port}
 
 
@@ -362,20 +342,20 @@ def own_ray(
         ConfigError: The port is in use, or the environment excludes Ray's token or HAProxy's settings.
     """
 
-    if os.environ.get(MODE, "token").lower() != "token":
+    if os.environ.get(session.MODE, "token").lower() != "token":
         raise ConfigError(
-            f"{MODE}={os.environ[MODE]}: a port of each replica, which runs whatever it is sent, would be open to "
-            f"other machines without Ray's token; unset it"
+            f"{session.MODE}={os.environ[session.MODE]}: a port of each replica, which runs whatever it is sent, "
+            f"would be open to other machines without Ray's token; unset it"
         )
     if not is_free(host, port):
         raise ConfigError(f"cannot listen on {host}:{port}: it is taken; choose another --port or --host")
     keep(port)
-    with ray_folder() as folder, contextlib.ExitStack() as stack:
+    with session.ray_folder() as folder, contextlib.ExitStack() as stack:
         # By default Ray starts workers with a low priority, so that a policy would wait for all other processes.
         # Proxies start while policies load: on a slow machine Serve would replace them after three times its 5 s.
         environment = {"RAY_worker_niceness": "0", "RAY_SERVE_PROXY_READY_CHECK_TIMEOUT_S": "60"}
         # The address at which replicas listen for WebSockets: loopback if only TLS may cross the network.
-        ours = {MARK: str(folder), ALONE: "0", HOST: host if tls is None else LOOPBACK}
+        ours = {MARK: str(folder), session.ALONE: "0", HOST: host if tls is None else LOOPBACK}
         listener = None
         if not ingress:
             ours |= NO_INGRESS
@@ -389,12 +369,12 @@ def own_ray(
         # replaced. Otherwise the user's values are kept, unless they are in `ours`.
         inherited = MARK in os.environ
         new = {key: value for key, value in environment.items() if inherited or key not in os.environ}
-        stack.enter_context(variables(new | ours))
-        stack.callback(use_loopback, use_loopback(True))  # this process read `ALONE` when it imported Ray
+        stack.enter_context(session.variables(new | ours))
+        stack.callback(private.use_loopback, private.use_loopback(True))  # `ALONE` was read when Ray was imported
         if listener is not None:
             listener.require()
-        start_ray(folder, num_cpus=num_cpus, logging_level="WARNING")
-        stack.push(unless_lost(leave_ray))
+        session.start_ray(folder, num_cpus=num_cpus, logging_level="WARNING")
+        stack.push(session.unless_lost(session.leave_ray))
         yield listener
 
 
