@@ -60,11 +60,6 @@ def keep(*ports: int) -> None:
     _kept.update(ports)
 
 
-def free_ports(number: int) -> list[int]:
-    """Return distinct ports that are free on all addresses, as HAProxy's metrics and statistics listen on all."""
-    return sorted(free_port(EVERYWHERE) for _ in range(number))
-
-
 def free_block(size: int) -> int:
     """Return the first of `size` consecutive ports for the replicas; it is free, and Ray skips any others in use."""
     for _ in range(100):

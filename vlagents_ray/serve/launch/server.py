@@ -147,8 +147,7 @@ def running_server(
     config = with_gateways_at(config, host)
     config = _access(config, keys_file, insecure, plain_http)
     if address is None:  # otherwise each replica checks and warns on its own machine
-        _require_access(config, host, insecure)
-        _warn_of_plain_http(config, host, tls)
+        _check_access(config, host, insecure, tls)
     if tls is not None:
         tls.check()
     for app in our_apps(config):
@@ -172,7 +171,6 @@ def running_server(
             )
         stack.push(session.unless_lost(lambda: shut_down(client)))
         _require_gpus(config)
-        remind = functools.partial(_missing_gpus, config)
         deploy(client, config, own=own, ingress=ingress)
         url = f"{'http' if tls is None else 'https'}://{LOOPBACK if host == EVERYWHERE else host}:{public}"
         paths = {app.name: (app.route_prefix or "").rstrip("/") for app in config.applications}
@@ -184,7 +182,7 @@ def running_server(
         ours = {app.name for app in our_apps(config)}
         urls = {name: inside + path if ingress else None for name, path in paths.items()}
         wait_for_proxies(proxies, lambda: private.proxies_now(client))
-        wait_until_ready(serve, urls, ours, deadline, remind)
+        wait_until_ready(serve, urls, ours, deadline, functools.partial(_missing_gpus, config))
         if ingress and address is None and (stats_port := os.environ.get("RAY_SERVE_HAPROXY_STATS_PORT")):
             wait_for_haproxy(serve, paths, int(stats_port), deadline)
         if own and ingress:
@@ -268,17 +266,18 @@ def _gpus(args: ServerArgs) -> float:
     return replicas * args.resources.num_gpus
 
 
-def _require_access(config: ServeDeploySchema, host: str, insecure: bool) -> None:
-    """Raise `ConfigError` if an application accepts other machines without keys, or its keys cannot be read."""
-    ours = our_apps(config)
+def _check_access(config: ServeDeploySchema, host: str, insecure: bool, tls: Tls | None) -> None:
+    """Check the access to each application, and warn if keys would cross the network unencrypted.
+
+    Raises:
+        ConfigError: An application accepts other machines without keys, or its keys cannot be read.
+    """
+    ours, plain = our_apps(config), False
     for app in config.applications:  # applications of other packages require no keys
         access = AccessArgs(**app.args.get("access", {})) if app in ours else AccessArgs(insecure=insecure)
-        require_access(host, access.keys() if app in ours else None, access.insecure)
-
-
-def _warn_of_plain_http(config: ServeDeploySchema, host: str, tls: Tls | None) -> None:
-    stated = [AccessArgs(**app.args.get("access", {})) for app in our_apps(config)]
-    if tls is None and any(access.keys() is not None and not access.plain_http for access in stated):
+        require_access(host, keys := access.keys() if app in ours else None, access.insecure)
+        plain = plain or (keys is not None and not access.plain_http)
+    if plain and tls is None:
         warn_of_plain_http(host)
 
 
@@ -291,7 +290,14 @@ def _ray(
 
     if not ray.is_initialized() and address is None:
         with own_ray(host, port, tls=tls, num_cpus=num_cpus, ingress=ingress) as listener:
-            yield _serve_address(listener, host, port, tls)
+            if listener is not None:
+                yield {"host": LOOPBACK, "port": listener.inside}
+            elif tls is None:
+                yield {"host": host, "port": port}
+            elif tls.client_ca is None:
+                yield {"host": host, "port": port, "ssl_certfile": str(tls.certificate), "ssl_keyfile": str(tls.key)}
+            else:
+                raise ConfigError("TLS with certificates of clients needs HAProxy: pip install 'vlagents-ray[serve]'")
         return
     if tls is not None:
         raise ConfigError(
@@ -314,17 +320,6 @@ def spread_over_gpus(parts: Mapping[str, ServeDeploySchema], *, kept: float = 0.
 
     share = max(0.0, ray.cluster_resources().get("GPU", 0.0) - kept) / len(parts)
     return {name: with_replicas_on(part, share) for name, part in parts.items()}
-
-
-def _serve_address(listener: PublicListener | None, host: str, port: int, tls: Tls | None) -> dict[str, Any]:
-    """Return Serve's own host, port and certificate."""
-    if listener is not None:
-        return {"host": LOOPBACK, "port": listener.inside}
-    if tls is None:
-        return {"host": host, "port": port}
-    if tls.client_ca is not None:
-        raise ConfigError("TLS with certificates of clients needs HAProxy: pip install 'vlagents-ray[serve]'")
-    return {"host": host, "port": port, "ssl_certfile": str(tls.certificate), "ssl_keyfile": str(tls.key)}
 
 
 @contextlib.contextmanager
@@ -360,7 +355,10 @@ def own_ray(
         if not ingress:
             ours |= NO_INGRESS
         elif (binary := haproxy_binary()) is not None:
-            listener = _public_listener(folder, host, port, tls)
+            if tls is not None or host not in (LOOPBACK, "localhost"):
+                bundle = None if tls is None else tls.bundle(folder)
+                client_ca = None if tls is None or tls.client_ca is None else tls.client_ca.absolute()
+                listener = PublicListener(host, port, free_port(), bundle, client_ca)
             settings = ingress_environment(folder, binary, listener)
             # HAProxy's files and admin socket are in the folder, regardless of the user's settings for clusters.
             ours |= {key: value for key, value in settings.items() if value.startswith(str(folder))}
@@ -376,18 +374,6 @@ def own_ray(
         session.start_ray(folder, num_cpus=num_cpus, logging_level="WARNING")
         stack.push(session.unless_lost(session.leave_ray))
         yield listener
-
-
-def _public_listener(folder: Path, host: str, port: int, tls: Tls | None) -> PublicListener | None:
-    if tls is None and host in (LOOPBACK, "localhost"):
-        return None
-    return PublicListener(
-        host,
-        port,
-        free_port(),
-        None if tls is None else tls.bundle(folder),
-        None if tls is None or tls.client_ca is None else tls.client_ca.absolute(),
-    )
 
 
 def wait_until_ready(
@@ -441,10 +427,17 @@ def _unready_reason(serve: Any, app: str, url: str | None, ours: Collection[str]
 
     A replica reports the reason, since over HTTP only clients with a key get it.
     """
+    from ray.exceptions import RayError
+    from ray.serve.exceptions import RayServeException
+
     refusal = None if url is None else _http_reason(url)
     if app not in ours or (url is not None and refusal is None):
         return refusal
-    return _replica_reason(serve, app) or refusal
+    try:
+        said: str | None = serve.get_app_handle(app).refusal.remote().result(timeout_s=5)
+    except (RayError, RayServeException, TimeoutError) as error:
+        said = str(error) or type(error).__name__
+    return said or refusal
 
 
 def _http_reason(url: str) -> str | None:
@@ -458,18 +451,6 @@ def _http_reason(url: str) -> str | None:
         return f"HTTP {error.code}"
     except OSError as error:
         return str(error)
-
-
-def _replica_reason(serve: Any, app: str) -> str | None:
-    """Return the reason why the policy cannot act yet, as its replica reports it; None if it can act."""
-    from ray.exceptions import RayError
-    from ray.serve.exceptions import RayServeException
-
-    try:
-        refusal: str | None = serve.get_app_handle(app).refusal.remote().result(timeout_s=5)
-    except (RayError, RayServeException, TimeoutError) as error:
-        return str(error) or type(error).__name__
-    return refusal
 
 
 def _reason(app: Any) -> str:
