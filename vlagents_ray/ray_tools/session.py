@@ -305,10 +305,7 @@ def join(server: str | None = None, **options: Any) -> LocalServer:
 def announce(url: str, apps: Mapping[str, str], ray_address: str) -> None:
     """Announce the server of this process's Ray, which is ready, in a file that other programs of this user can find.
 
-    Args:
-        url: The server's URL.
-        apps: Its applications by name.
-        ray_address: The address of its Ray cluster, host:port.
+    `apps` are its applications by name, and `ray_address` is host:port of its Ray cluster.
     """
     new = Path(os.environ[MARK]) / f"{_FILE}.new"
     new.write_text(json.dumps(asdict(LocalServer(url, tuple(apps), ray_address))))

@@ -66,14 +66,8 @@ class EnvironmentArgs(_DeploymentModel):
 
     def runtime_env(self) -> dict[str, Any]:
         """Return Ray's `runtime_env` of the replica; empty if the policy runs in a child process."""
-        if self.process == "child":
-            return {}
-        found: dict[str, Any] = {}
-        if self.python is not None:
-            found["py_executable"] = self.python
-        if self.env_vars:
-            found["env_vars"] = self.env_vars
-        return found
+        stated = {"py_executable": self.python, "env_vars": self.env_vars}
+        return {} if self.process == "child" else {name: value for name, value in stated.items() if value}
 
 
 class BatchArgs(_DeploymentModel):
@@ -129,12 +123,7 @@ class CheckpointArgs(_DeploymentModel):
         return choices
 
     def of(self, make: Callable[[Mapping[str, Any]], Agent], config: Mapping[str, Any]) -> Checkpoints:
-        """Return the checkpoints of a policy.
-
-        Args:
-            make: Builds the policy from its settings.
-            config: The deployment's own settings of the policy.
-        """
+        """Return the checkpoints of a policy that `make` builds; `config` are the deployment's own settings of it."""
         return Checkpoints(make, config, self.choices, steps=self.steps, loaded=self.loaded)
 
 

@@ -11,7 +11,7 @@ from collections.abc import Iterator, Mapping
 from functools import cache
 from typing import Any
 
-from pydantic import BaseModel, ConfigDict, Field, create_model, field_validator, model_validator
+from pydantic import BaseModel, Field, create_model, field_validator, model_validator
 from pydantic.fields import FieldInfo
 
 from vlagents_ray.errors import ConfigError
@@ -23,10 +23,8 @@ from vlagents_ray.wire.mapping import KeyMapping
 MappingSetting = str | dict[str, Any]
 
 
-class DialectConfig(BaseModel):
+class DialectConfig(BaseModel, extra="forbid"):
     """The settings that all dialects have; the `Config` of a dialect adds its own."""
-
-    model_config = ConfigDict(extra="forbid")
 
     mapping: MappingSetting | None = Field(
         default=None,
@@ -66,10 +64,8 @@ class KeylessPortConfig(PortConfig):
     )
 
 
-class DialectArgs(BaseModel):
+class DialectArgs(BaseModel, extra="allow"):
     """The settings of all dialects that are on, by name."""
-
-    model_config = ConfigDict(extra="allow")
 
     @model_validator(mode="before")
     @classmethod

@@ -14,7 +14,7 @@ import time
 from collections.abc import Mapping
 from typing import Any, ClassVar
 
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import BaseModel, Field, model_validator
 
 from vlagents_ray.contract import ActionSpec, Contract
 from vlagents_ray.errors import (
@@ -308,10 +308,8 @@ class SharedMemory:
         return descriptor
 
 
-class GripperArgs(BaseModel):
+class GripperArgs(BaseModel, extra="forbid"):
     """The column of a robot's gripper in a row of the policy's actions, and its values."""
-
-    model_config = ConfigDict(extra="forbid")
 
     column: int = Field(default=-1, description="as in Python: -1 is the last")
     open: float | None = Field(default=None, description="its value for open; default: the policy's contract, or 1")
@@ -324,10 +322,8 @@ class GripperArgs(BaseModel):
         return self
 
 
-class RobotArgs(BaseModel):
+class RobotArgs(BaseModel, extra="forbid"):
     """The columns of one robot in a row."""
-
-    model_config = ConfigDict(extra="forbid")
 
     start: int | None = None
     stop: int | None = None

@@ -128,12 +128,8 @@ class Child:
         self.sessions.add(name)
         return name
 
-    def close_session(self, name: str) -> None:
-        """Close a session soon; return at once, as the garbage collector may call this at any moment."""
-        self._left.put(name)
-
-    def forget_weights(self, name: int) -> None:
-        """Drop a version of the weights soon, as `close_session` does."""
+    def drop(self, name: str | int) -> None:
+        """Close a session, or drop a version of the weights, soon; the garbage collector may call this at any time."""
         self._left.put(name)
 
     def call_for_weights(self, **call: Any) -> dict[str, Any]:
@@ -340,7 +336,7 @@ class ChildAgent(Agent, HoldsWeights):
 
     def __del__(self) -> None:
         if (session := getattr(self, "_session", None)) is not None:
-            self._child.close_session(session)
+            self._child.drop(session)
 
 
 class ChildWeights(ModelWeights):
@@ -404,7 +400,7 @@ class ChildWeights(ModelWeights):
 
     def _name(self, version: WeightsVersion, name: int) -> None:
         self._names[version] = name
-        finalize(version, self._child.forget_weights, name).atexit = False
+        finalize(version, self._child.drop, name).atexit = False
 
 
 def _memory() -> BinaryIO:

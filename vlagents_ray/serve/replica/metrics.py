@@ -69,13 +69,9 @@ class Exporter:
         keys: Keys | None = None,
         recorder: SessionRecorder | None = None,
     ) -> None:
-        """Create the series.
+        """Create the series of an engine with the `tags` application, deployment, replica and policy.
 
-        Args:
-            engine: The engine.
-            tags: Their tags: application, deployment, replica, policy.
-            keys: The keys, whose file's state is exported; None if there are none.
-            recorder: The recorder, whose counts are exported; None if there is none.
+        The state of the file of the `keys` and the counts of the `recorder` are exported, if there are any.
         """
         make = partial(_series, tags)
         self._engine = engine

@@ -267,7 +267,7 @@ class PolicyReplica(ClientApi, SiblingApi):
             must_be_near: Whether the client's transport reaches no other machine.
         """
         place = ClientLocation(node, boot_id, must_be_near)
-        return await self._place_at_sibling(place) or self._connection_info()
+        return await self._rebalancer.place(place) or self._connection_info()
 
     async def call(self, session_id: str, frame: Any) -> bytes:
         """Execute a frame of requests from inside the cluster, a buffer that is read in place from plasma."""
@@ -292,13 +292,8 @@ class PolicyReplica(ClientApi, SiblingApi):
         """Return the metadata of the least loaded replica on the machine with boot id `caller`, or of this replica."""
         machines = [boot_id()] if caller == SERVERS_MACHINE else [caller, boot_id()]
         places = [ClientLocation(boot_id=machine, must_be_near=True) for machine in machines]
-        metadata, _ = await self._place_at_sibling(*places) or (self.metadata(), None)
+        metadata, _ = await self._rebalancer.place(*places) or (self.metadata(), None)
         return {key: value for key, value in metadata.items() if key != "plasma"}
-
-    async def _place_at_sibling(self, *places: ClientLocation) -> tuple[dict[str, Any], Any] | None:
-        """Return metadata and actor of another replica if it suits the client better, see `Rebalancer.place`."""
-        found: tuple[dict[str, Any], Any] | None = await self._rebalancer.place(*places)
-        return found
 
     # Other replicas: `SiblingApi`.
 
