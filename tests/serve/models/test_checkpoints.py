@@ -403,7 +403,7 @@ def test_sessions_move_between_replicas_with_the_same_weights_only(tmp_path: Pat
         file.write_bytes(content)
         engine = Engine(Stored(file))
         engine.start()
-        versions.append(engine.version)
+        versions.append(engine.models.version)
         engine.close()
     assert versions[0] == versions[1] != versions[2]
 

@@ -50,6 +50,21 @@ Control = Sequence[tuple[int, int, bytes]]
 Admit = Callable[[str | None], Caller]  # returns the caller with that key; raises `Unauthorized` or `Forbidden`
 
 
+class ReadBuffer(threading.local):
+    """Memory of `size` bytes for each thread to read into: new memory would cost as much as copying from here."""
+
+    def __init__(self, size: int) -> None:
+        self._view = memoryview(bytearray(size))
+
+    def receive(self, connection: socket.socket, size: int, space: int = STAMP_SPACE) -> tuple[memoryview, Control]:
+        """Read at most `size` bytes, and `space` bytes of control data, from a connection that is readable.
+
+        The bytes are valid until this thread reads again; there are none if the connection has ended.
+        """
+        count, control, _, _ = connection.recvmsg_into([self._view[:size]], space)
+        return self._view[:count], control
+
+
 class Acceptor:
     """Accepts connections; errors (an aborted connection, EMFILE) never stop the listener."""
 

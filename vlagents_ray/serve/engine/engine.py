@@ -169,7 +169,7 @@ class Engine:
         except BaseException as error:  # noqa: BLE001 - raised again by start(), on the caller's thread
             self._not_started = error
             self.alive = False
-            self.queue.release()
+            self.queue.poller.close()
             return
         finally:
             self.queue.bind()
@@ -191,7 +191,7 @@ class Engine:
                 del taken  # their observations may be in the sender's memory
             _send(self._unsent)
             self._answers.shutdown()
-            self.queue.release()
+            self.queue.poller.close()
         finally:
             self.alive = False
 
@@ -273,7 +273,7 @@ class Engine:
         for pending in self.queue.close():
             self._fail(pending, PolicyUnavailable("the replica is stopping; connect again"))
         if self._thread.ident is None:
-            self.queue.release()
+            self.queue.poller.close()
         elif self._thread is not threading.current_thread():
             self._thread.join(timeout_s)
 
@@ -281,11 +281,6 @@ class Engine:
     def contract(self) -> Contract | None:
         """Contract of the deployment's own checkpoint; None until that is loaded, or if it has no contract."""
         return self.models.contract
-
-    @property
-    def version(self) -> tuple[str, str]:
-        """Version of the policy; replicas of equal versions can take over each other's sessions."""
-        return self.models.version
 
     def submit(self, requests: Sequence[PendingRequest]) -> None:
         """Check requests, and queue them together; those that cannot be queued are finished with their errors."""

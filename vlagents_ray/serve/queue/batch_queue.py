@@ -37,8 +37,8 @@ class Taken(NamedTuple):
 class BatchQueue:
     """The waiting requests, and the watched files that deliver new ones.
 
-    One thread, the policy's, calls `bind`, then in turns `next`, `begin` and `end`, and at last `release`. It waits on
-    file descriptors, so that a local client's socket can be one of them: its request then reaches the policy without a
+    One thread, the policy's, calls `bind`, then in turns `next`, `begin` and `end`, at last `poller.close`. It waits on
+    file descriptors, so that a local client's socket can be one: its request then reaches the policy without a
     thread switch. While batches take milliseconds and are not all for one session, a second thread polls these files,
     so that the next batch is already decoded when the current one ends.
 
@@ -180,10 +180,6 @@ class BatchQueue:
             self._wait_over.set()
             self._wake()
             return self._waiting.clear()
-
-    def release(self) -> None:
-        """Close the poller, when no thread takes batches any more."""
-        self.poller.close()
 
     def _wake(self) -> None:
         if self._asleep and threading.get_ident() != self._thread:  # if the policy's thread calls this, it is awake

@@ -300,7 +300,7 @@ class PolicyReplica(ClientApi, SiblingApi):
     def _load_of(self, sessions: int) -> ReplicaLoad:
         accepts = self._engine.ready and not (self._engine.draining or replica_is_ending())
         node = ray.get_runtime_context().get_node_id()
-        return ReplicaLoad(self._peers.own_name, sessions, accepts, node, boot_id(), self._engine.version)
+        return ReplicaLoad(self._peers.own_name, sessions, accepts, node, boot_id(), self._engine.models.version)
 
     async def expect_client(self) -> tuple[dict[str, Any], Any]:
         """Return metadata and actor for a client that another replica redirects to this one."""
