@@ -343,7 +343,10 @@ class ModelWeights:
     def portable_values(self, version: WeightsVersion) -> dict[str, Any]:
         """Return the values of a version as numpy arrays, for another process."""
         with self._uncaptured():
-            return {name: trainable.portable(value) for name, value in self._values(version).items()}
+            with self._busy if self._in_place else nullcontext():  # another version could become the agent's
+                values = self._agent.parameters() if version.values is None else version.values
+                values = trainable.mapped(trainable.own_copy, values) if self._in_place else values
+            return {name: trainable.portable(value) for name, value in values.items()}
 
     def sleep(self, *, offload: bool) -> None:
         """Free the memory that torch has cached and, with `offload`, that of all versions and graphs, until `wake`.
@@ -405,11 +408,6 @@ class ModelWeights:
             return values
         with self._busy:
             return self._agent.parameters()
-
-    def _values(self, version: WeightsVersion) -> dict[str, Any]:
-        with self._busy if self._in_place else nullcontext():  # another version could become the agent's
-            values = self._agent.parameters() if version.values is None else version.values
-            return trainable.mapped(trainable.own_copy, values) if self._in_place else values
 
     def _move_to_host(self, used: set[WeightsVersion | None]) -> None:
         """Move the pinned and the newest version out of the GPU's memory, unless it is the agent's or one of `used`."""

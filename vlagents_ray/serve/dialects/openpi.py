@@ -18,6 +18,7 @@ import abc
 import time
 import uuid
 from collections.abc import Mapping, Sequence
+from functools import partial
 from typing import Any, ClassVar
 
 import numpy as np
@@ -43,10 +44,10 @@ class MapDialect(base.RouteDialect):
 
     async def stream(self, socket: WebSocket) -> None:
         """Serve one connection at this dialect's path."""
-        await MapEndpoint([self]).stream(socket)
+        await _stream([self], socket)
 
     def at_root(self, sharing: Sequence[MapDialect]) -> base.Stream:
-        return MapEndpoint(sharing).stream
+        return partial(_stream, sharing)
 
     @abc.abstractmethod
     def first(self) -> dict[str, Any]:
@@ -191,61 +192,55 @@ class MapConnection:
         return self._batched
 
 
-class MapEndpoint:
-    """A path at which clients of these dialects connect; the last dialect sends the first message."""
+async def _stream(dialects: Sequence[MapDialect], socket: WebSocket) -> None:
+    """Serve one connection at a path of these dialects, of which the last one sends the first message."""
+    if not await base.accept_or_refuse(socket, dialects[0].context):
+        return
+    connections: dict[str, MapConnection] = {}
+    gate = dialects[0].gate()
+    try:
+        await socket.send_bytes(openpi.encode(dialects[-1].first()))
+        while (received := await dialects[0].receive(socket, gate)) is not None:
+            if not await _answer(dialects, socket, *received, connections, gate):
+                return
+    except WebSocketDisconnect:
+        return
+    finally:
+        for connection in connections.values():
+            connection.sender.release(for_good=True)
 
-    def __init__(self, dialects: Sequence[MapDialect]) -> None:
-        self._dialects = dialects
-        self._context = dialects[0].context
 
-    async def stream(self, socket: WebSocket) -> None:
-        """Serve one connection; its sessions end with it."""
-        if not await base.accept_or_refuse(socket, self._context):
-            return
-        connections: dict[str, MapConnection] = {}
-        gate = self._dialects[0].gate()
-        try:
-            await socket.send_bytes(openpi.encode(self._dialects[-1].first()))
-            while (received := await self._dialects[0].receive(socket, gate)) is not None:
-                if not await self._answer(socket, *received, connections, gate):
-                    return
-        except WebSocketDisconnect:
-            return
-        finally:
-            for connection in connections.values():
-                connection.sender.release(for_good=True)
-
-    async def _answer(
-        self,
-        socket: WebSocket,
-        data: bytes | None,
-        admission: MessageAdmission,
-        connections: dict[str, MapConnection],
-        gate: Sender,
-    ) -> bool:
-        """Reply to one message; return False if the connection was closed."""
-        incoming, request_id = self._dialects[0].arrived(), uuid.uuid4().hex
-        try:
-            message = await base.decoded(lambda data, budget: openpi.decode(data, budget.limits), data, admission)
-            dialect = next((dialect for dialect in self._dialects if dialect.speaks(message)), self._dialects[0])
-            arrived, incoming = incoming.arrived, dialect.arrived()
-            incoming.arrived = arrived
-            connection = connections.get(dialect.name) or connections.setdefault(dialect.name, MapConnection(dialect))
-            answer = await connection.answer(message, incoming, request_id, gate)
-        except Exception as error:  # noqa: BLE001 - the error is the reply to the client
-            problem = public_problem(error, incoming.transport, request_id)
-            incoming.record_failure(problem.code)
-            await socket.send_text(f"{problem} (request {request_id})")
-            if isinstance(problem, TooManyRequests):  # the connection stays open, as nothing was acted on
-                if gate.refused_too_often:
-                    await socket.close(base.POLICY_VIOLATION, REFUSED)
-                return not gate.refused_too_often
-            await socket.close(base.INTERNAL_ERROR, "Internal server error.")
-            return False
-        finally:
-            admission.release()
-        if isinstance(answer, str):
-            await socket.send_text(answer)
-        elif answer:
-            await socket.send_bytes(answer)
-        return True
+async def _answer(
+    dialects: Sequence[MapDialect],
+    socket: WebSocket,
+    data: bytes | None,
+    admission: MessageAdmission,
+    connections: dict[str, MapConnection],
+    gate: Sender,
+) -> bool:
+    """Reply to one message; return False if the connection was closed."""
+    incoming, request_id = dialects[0].arrived(), uuid.uuid4().hex
+    try:
+        message = await base.decoded(lambda data, budget: openpi.decode(data, budget.limits), data, admission)
+        dialect = next((dialect for dialect in dialects if dialect.speaks(message)), dialects[0])
+        arrived, incoming = incoming.arrived, dialect.arrived()
+        incoming.arrived = arrived
+        connection = connections.get(dialect.name) or connections.setdefault(dialect.name, MapConnection(dialect))
+        answer = await connection.answer(message, incoming, request_id, gate)
+    except Exception as error:  # noqa: BLE001 - the error is the reply to the client
+        problem = public_problem(error, incoming.transport, request_id)
+        incoming.record_failure(problem.code)
+        await socket.send_text(f"{problem} (request {request_id})")
+        if isinstance(problem, TooManyRequests):  # the connection stays open, as nothing was acted on
+            if gate.refused_too_often:
+                await socket.close(base.POLICY_VIOLATION, REFUSED)
+            return not gate.refused_too_often
+        await socket.close(base.INTERNAL_ERROR, "Internal server error.")
+        return False
+    finally:
+        admission.release()
+    if isinstance(answer, str):
+        await socket.send_text(answer)
+    elif answer:
+        await socket.send_bytes(answer)
+    return True

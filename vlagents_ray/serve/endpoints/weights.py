@@ -50,19 +50,15 @@ class ReceivesWeights(Protocol):
 
     def read_header(self, header: bytes, options: PushOptions) -> dict[str, ValueSpec]:
         """Return the types and shapes of the announced values; raise an error if they do not fit the policy."""
-        ...
 
     async def push_received(self, named: Mapping[str, Any], options: PushOptions) -> PushResult:
         """Make all replicas act with new weights."""
-        ...
 
     async def rest(self, rest: Rest) -> None:
         """Let all replicas take a step of a rest."""
-        ...
 
     async def versions_of_weights(self) -> list[int]:
         """Return the newest version of each replica."""
-        ...
 
 
 def weights_routes(replicas: ReceivesWeights, slow_s: float, *, open_to_network: bool) -> list[BaseRoute]:

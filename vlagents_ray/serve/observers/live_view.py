@@ -239,11 +239,9 @@ class OtherReplicas(Protocol):
 
     async def views(self) -> dict[str, SnapshotReader]:
         """Return the readers of the replicas' snapshots, by name."""
-        ...
 
     async def press(self, session: str, do: str, by: str) -> dict[str, Any] | None:
         """Give a command to a session, see `CommandBoard.press`; return None if no replica has the session."""
-        ...
 
 
 class Viewer:

@@ -39,11 +39,9 @@ class SiblingApi(Protocol):
 
     async def expect_client(self) -> tuple[dict[str, Any], Any]:
         """Expect a client that another replica sends here; return the metadata for the client, and the actor."""
-        ...
 
     async def peer(self, method: str, *args: Any) -> Any:
         """Call the method of that name in `PEER_METHODS`, and return its result."""
-        ...
 
 
 class PeerMethod(NamedTuple):

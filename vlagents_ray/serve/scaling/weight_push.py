@@ -38,7 +38,6 @@ class WeightsReplica(Protocol):
 
     async def weights(self, method: Callable[..., T], *args: Any) -> T:
         """Call a method of the replica's `WeightUpdates`; also raise `PeerEnded` and `PeerUnreachable`."""
-        ...
 
 
 class ThisReplica(WeightsReplica):
