@@ -68,8 +68,7 @@ class ValueReader:
     """Converts JSON back to values, which are views of the blobs where possible."""
 
     def __init__(self, blobs: Sequence[Buffer], budget: Budget) -> None:
-        self._blobs = blobs
-        self._budget = budget
+        self._blobs, self._budget = blobs, budget
         self._limits = budget.limits
         self._items = 0
         self._images: dict[int, np.ndarray] = {}  # by blob: each image is decoded once, whatever its number of uses

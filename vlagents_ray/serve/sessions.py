@@ -107,8 +107,7 @@ class SessionTable(Generic[M]):
         self._sessions: dict[str, Session[M]] = {}
         self.limit = limit
         self.opened = 0  # number of sessions opened so far
-        self._idle_s = idle_s
-        self._clock = clock
+        self._idle_s, self._clock = idle_s, clock
         self._drawn = 0  # latest step drawn
         self._left: OrderedDict[str, Version] = OrderedDict()  # by session: version up to which its states are refused
         self._lock = threading.Lock()

@@ -473,8 +473,7 @@ class WeightUpdates:
             sessions: Returns the sessions, which act with them.
             acting: The lock that the policy's thread holds while it runs a batch.
         """
-        self.own = own
-        self._sessions = sessions
+        self.own, self._sessions = own, sessions
         self._acting = acting or threading.Lock()
         self._resting = threading.RLock()  # held during each step of a rest
         self._asleep: ModelWeights | None = None  # those of the policy that sleeps, for which `acting` is held

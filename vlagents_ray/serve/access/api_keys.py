@@ -63,8 +63,7 @@ class Keys:
             read: Returns the text of the key file.
             changed: Returns an object that differs when the text may have changed.
         """
-        self._read = read
-        self._changed = changed
+        self._read, self._changed = read, changed
         self._keys: dict[bytes, Key] = {}
         self._buckets: dict[str, _Bucket] = {}
         self._held: Counter[str] = Counter()  # number of connections, by the key's name
@@ -402,8 +401,7 @@ class ScopeCheck:
     """
 
     def __init__(self, subject: str, *, open_to_network: bool) -> None:
-        self._subject = subject
-        self._open_to_network = open_to_network
+        self._subject, self._open_to_network = subject, open_to_network
 
     def require(self, scope: str | None) -> None:
         """Check the key of the current request, and its scope if one is given.

@@ -134,9 +134,7 @@ class Dialect(abc.ABC):
     presets: ClassVar[Mapping[str, Mapping[str, Any]]] = {}  # mappings that deployment files may name
 
     def __init__(self, name: str, config: DialectConfig, context: ReplicaContext | GatewayContext) -> None:
-        self.name = name
-        self.config = config
-        self.context = context
+        self.name, self.config, self.context = name, config, context
         self.mapping = config.keys() or read_mapping(_OUR_NAMES)
 
     @classmethod
@@ -331,8 +329,7 @@ class ImplicitSession:
 
     def __init__(self, engine: Engine, sender: Sender, rank: RankName = "robot", name: str = "") -> None:
         self.episode = ImplicitEpisode()
-        self._engine = engine
-        self._sender = sender
+        self._engine, self._sender = engine, sender
         self._rank: RankName = rank
         self._name = name
 

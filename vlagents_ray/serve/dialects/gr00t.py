@@ -329,8 +329,7 @@ class _Strangers:
         """Monitor connections; `most_bytes` limits the bytes of all these connections together, and of one message."""
         self.monitor = router.get_monitor_socket(zmq.EVENT_ACCEPTED | zmq.EVENT_DISCONNECTED)
         self._router, self._zmq = router, zmq
-        self._port = port
-        self._most_bytes = most_bytes
+        self._port, self._most_bytes = port, most_bytes
         self._since: dict[int, tuple[socket.socket, float]] = {}  # by the descriptor in ZeroMQ, oldest first
         self._clients: dict[int, GR00TConnection] = {}
 

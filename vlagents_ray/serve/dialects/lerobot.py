@@ -76,8 +76,7 @@ class LeRobotConnection(GatewayClient):
 
     def __init__(self, context: GatewayContext, mapping: KeyMapping, checkpoint: str | None) -> None:
         super().__init__(context)
-        self._mapping = mapping
-        self._checkpoint = checkpoint
+        self._mapping, self._checkpoint = mapping, checkpoint
         self.sessions.show(NoKey.OPEN, None)  # the protocol has no key, and the deployment accepted that
         self._robot: PolicyInstructions | None = None
         self._acted = -1  # time step of the last observation that the policy received

@@ -51,8 +51,7 @@ class VlagentsConnection:
 
     def __init__(self, dialect: VlagentsDialect, connection: socket.socket) -> None:
         self._context = context = dialect.context
-        self._dialect = dialect
-        self._connection = connection
+        self._dialect, self._connection = dialect, connection
         self._session = GatewaySessions(context.connect, context.contract)
         self._session.show(NoKey.OPEN, None)  # the protocol has no key, and the deployment accepted that
         self._segments = SharedMemory(same_machine=dialect.config.shared_memory and _is_same_machine(connection))

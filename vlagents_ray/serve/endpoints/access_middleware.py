@@ -53,12 +53,8 @@ class AccessMiddleware:
             idle_s: Maximum time that a WebSocket may be silent, s.
             hosts: Further host names of the server, see `require_own_page`.
         """
-        self._app = app
-        self._keys = keys
-        self._name = name
-        self._hosts = hosts
-        self._slow_s = slow_s
-        self._idle_s = idle_s
+        self._app, self._keys, self._name = app, keys, name
+        self._hosts, self._slow_s, self._idle_s = hosts, slow_s, idle_s
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Serve one connection as specified by ASGI."""
@@ -171,11 +167,8 @@ class _TimedWebSocket:
     """A WebSocket that ends when its key becomes invalid, or its client is silent or does not read replies."""
 
     def __init__(self, caller: Identity, slow_s: float, idle_s: float, receive: Receive, send: Send) -> None:
-        self._caller = caller
-        self._slow_s = slow_s
-        self._idle_s = idle_s
-        self._receive = receive
-        self._send = send
+        self._caller, self._slow_s, self._idle_s = caller, slow_s, idle_s
+        self._receive, self._send = receive, send
         self._loop = asyncio.get_running_loop()
         self._silent_since: float | None = None  # start of the wait for the next message, s; None if there is no wait
         self._sending_since: float | None = None  # start of the current sending, s; None if there is none

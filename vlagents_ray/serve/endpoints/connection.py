@@ -75,8 +75,7 @@ class Acceptor:
             listener: The listening socket.
             on_connection: Called with each connection, which is non-blocking; it must close those that it refuses.
         """
-        self._listener = listener
-        self._on_connection = on_connection
+        self._listener, self._on_connection = listener, on_connection
         # Without a free descriptor a client could not even be refused, and the listener would stay readable.
         self._spare = _descriptor()
 

@@ -94,9 +94,7 @@ class _HttpEndpoint:
         limits: messages.Limits,
         machine_metadata: Callable[[str], Awaitable[dict[str, Any]]] | None,
     ) -> None:
-        self._engine = engine
-        self._metadata = metadata
-        self._limits = limits
+        self._engine, self._metadata, self._limits = engine, metadata, limits
         self._requests = RequestDecoder(limits)
         self._machine_metadata = machine_metadata
 

@@ -92,8 +92,7 @@ class UnixServer(PolledServer["UnixConnection"]):
         """Create the server; `payload` creates the payload of a connection, and `ops` are the accepted operations."""
         listener = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET | socket.SOCK_NONBLOCK)
         super().__init__(engine, limits, admit, listener)
-        self.payload = payload
-        self.ops = ops
+        self.payload, self.ops = payload, ops
 
     @abstractmethod
     def listen(self) -> None:

@@ -517,9 +517,7 @@ class SendBuffer:
 
     def __init__(self, connection: socket.socket, lock: threading.Lock, limit: int) -> None:
         """Create an empty buffer; a client is cut off if more than `limit` bytes wait, or it reads none for 10 s."""
-        self._connection = connection
-        self._lock = lock
-        self._limit = limit
+        self._connection, self._lock, self._limit = connection, lock, limit
         self._unsent = bytearray()
         self._slow = False  # whether a thread is sending the rest
         self._closed = self._last = False

@@ -79,8 +79,7 @@ def weights_routes(replicas: ReceivesWeights, slow_s: float, *, open_to_network:
 
 class _WeightsEndpoint:
     def __init__(self, replicas: ReceivesWeights, slow_s: float, open_to_network: bool) -> None:
-        self._replicas = replicas
-        self._slow_s = slow_s
+        self._replicas, self._slow_s = replicas, slow_s
         self._scopes = ScopeCheck("weights", open_to_network=open_to_network)
         self._receiving = False
 

@@ -125,8 +125,7 @@ class MessageAdmission(Budget):
         """
         super().__init__(limits)
         self.files = {} if keep_files else None
-        self._admission = admission
-        self._admit = admit
+        self._admission, self._admit = admission, admit
         self.size = size  # size of the message, until it is counted
         self._robot = robot
         self._held = 0  # bytes counted as in flight

@@ -92,8 +92,7 @@ class _Pickler(pickle.Pickler):
 
     def __init__(self, file: io.BytesIO, shared: _Shared, *, find: bool) -> None:
         super().__init__(file, protocol=pickle.HIGHEST_PROTOCOL)
-        self._shared = shared
-        self._find = find
+        self._shared, self._find = shared, find
 
     def persistent_id(self, obj: Any) -> int | None:
         """Return the index of a shared object, or None for an object that is copied."""

@@ -207,12 +207,9 @@ class Loader:
         calls: PolicyCalls,
     ) -> None:
         """Create the loader; its arguments are described at `Engine`."""
-        self._source = source
-        self._version = version
-        self._batch_sizes = batch_sizes
+        self._source, self._version, self._batch_sizes = source, version, batch_sizes
         self._compiled_sizes = batch_sizes or powers_up_to(max_batch_size)
-        self._check = check
-        self._calls = calls
+        self._check, self._calls = check, calls
         self.on_progress: Callable[[str], None] = lambda _: None  # called with each step of a long load
         self.on_out_of_memory: Callable[[], None] = lambda: None  # called each time that a model runs out of memory
         self.on_gpu_ms: Callable[[float], None] = lambda _: None  # called with the time of forward passes on a GPU

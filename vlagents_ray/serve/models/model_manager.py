@@ -226,8 +226,7 @@ class ModelManager:
         self.files: Program = {}  # digests of the files named in the settings of that model
         self.step = ""  # the step of a long first load, such as "compiling 4 rows (3 of 5)"
         self.on_step: Callable[[str], None] = lambda _: None  # called with `step`, on the loading thread
-        self._source = source
-        self._loader = loader
+        self._source, self._loader = source, loader
         loader.on_progress = self._set_step
         self._sessions = sessions
         self._first: Agent | None = None

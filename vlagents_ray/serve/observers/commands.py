@@ -69,9 +69,7 @@ class CommandBoard:
 
         `save` writes the last seconds of a session and returns the path; it may be slow, and may raise errors.
         """
-        self._save = save
-        self._sessions = sessions
-        self._clock = clock
+        self._save, self._sessions, self._clock = save, sessions, clock
         self._numbers = itertools.count(1)
         self._prefix = uuid.uuid4().hex[:8]
         self._presses: dict[str, list[Press]] = {}  # by session, oldest first

@@ -106,12 +106,8 @@ class EpisodeWriter:
         """
         self.saved = 0  # number of frames in complete episodes
         self.lost = 0  # number of frames in episodes that could not be written
-        self._folder = folder
-        self._name = name
-        self._fps = fps
-        self._lossless = lossless
-        self._most_bytes = most_bytes
-        self._describe = describe
+        self._folder, self._name, self._fps = folder, name, fps
+        self._lossless, self._most_bytes, self._describe = lossless, most_bytes, describe
         self._shelves: list[_Shelf] = []
         self._running: dict[str, _Running] = {}
         self._numbers = 0

@@ -101,9 +101,7 @@ class LiveObserver(Observer):
         self, observers: Observers, commands: CommandBoard | None = None, clock: Callable[[], float] = time.monotonic
     ) -> None:
         """Create an inactive observer, which `renew` adds to `observers`; `commands` are sent in the answers."""
-        self._observers = observers
-        self._commands = commands
-        self._clock = clock
+        self._observers, self._commands, self._clock = observers, commands, clock
         self._until = float("-inf")  # end of the lease, s
         self._active = False
         self._numbers = itertools.count(1)

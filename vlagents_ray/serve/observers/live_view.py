@@ -292,9 +292,7 @@ class Fleet:
 
         `more` returns further entries of the document; if nothing has changed, it returns the same object as before.
         """
-        self._own = own
-        self._others = others
-        self._more = more
+        self._own, self._others, self._more = own, others, more
         self._viewers: set[Viewer] = set()
         self._gathering: asyncio.Task[None] | None = None
         self._read: dict[str, int] = {}  # number of the last snapshot, by replica; "" is this one

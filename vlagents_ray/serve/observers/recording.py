@@ -130,10 +130,8 @@ class SessionRecorder(Observer):
         """
         self.dropped = 0  # number of acts that exceeded the memory, or whose episode could not be written
         self.ended: str | None = None  # reason why nothing more is recorded
-        self._writer = writer
-        self._sessions = sessions
-        self._share = share
-        self._held_bytes = held_bytes
+        self._writer, self._sessions = writer, sessions
+        self._share, self._held_bytes = share, held_bytes
         self._held = 0
         self._lock = threading.RLock()  # guards `_held`, which the garbage collector may reduce at any time
         self._looking = False  # whether a comparison of the current sessions with `_first` is scheduled

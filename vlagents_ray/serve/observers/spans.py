@@ -38,8 +38,7 @@ class RequestSpans(Observer):
 
     def __init__(self, tracer: Any, replica: str) -> None:
         """Trace requests with `tracer`, under the replica's name."""
-        self._tracer = tracer
-        self._replica = replica
+        self._tracer, self._replica = tracer, replica
         self._answered: deque[_ServedRequest] = deque(maxlen=_KEPT)
         self._trace = require("opentelemetry.trace", extra="otel")
         module = require("opentelemetry.trace.propagation.tracecontext", extra="otel")

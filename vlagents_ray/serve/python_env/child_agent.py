@@ -63,9 +63,7 @@ class Child:
         self.continues_plans = False  # whether the policy's chunks continue a plan, set by `start`
         self.trained: dict[str, Any] = {}  # the values that a learner trains, set by `start`: see `child_main`
         self.sessions: set[str] = set()  # names of the sessions in the child
-        self._python = python
-        self._settings = settings
-        self._env_vars = env_vars
+        self._python, self._settings, self._env_vars = python, settings, env_vars
         self._process: subprocess.Popen[bytes] | None = None
         self._spawned: queue.SimpleQueue[subprocess.Popen[bytes] | OSError] = queue.SimpleQueue()
         self._last_words: deque[str] = deque(maxlen=_LAST_WORDS)

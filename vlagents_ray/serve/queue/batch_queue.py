@@ -60,8 +60,7 @@ class BatchQueue:
         clock: Callable[[], float] = time.perf_counter,
         poller: Poller | None = None,
     ) -> None:
-        self._clock = clock
-        self._idle_s = idle_s
+        self._clock, self._idle_s = clock, idle_s
         self.largest = max_batch_size
         self._waiting = FairQueue()
         self._load_timer = LoadTimer()  # counts the time until the policy is loaded as idle

@@ -39,8 +39,7 @@ class PolicyCall:
     __slots__ = ("_calls", "_count", "_longest_s", "_process", "_thread", "began", "ended", "op")
 
     def __init__(self, calls: PolicyCalls, op: str) -> None:
-        self.op = op
-        self._calls = calls
+        self.op, self._calls = op, calls
         self.began = self.ended = 0.0  # times of the last call, s of `PolicyCalls.clock`; for the calling thread only
         self._thread = self._process = 0
         self._count = 0

@@ -71,10 +71,8 @@ class HeldSessions:
 
     def __init__(self, engine: Engine, loop: asyncio.AbstractEventLoop, in_thread: InThread, spawn: Spawn) -> None:
         """Move the sessions of an engine; `in_thread` runs a slow call (unpickling) on another thread."""
-        self._engine = engine
-        self._loop = loop
-        self._in_thread = in_thread
-        self._spawn = spawn
+        self._engine, self._loop = engine, loop
+        self._in_thread, self._spawn = in_thread, spawn
         self._claims: OrderedDict[str, asyncio.Task[bool]] = OrderedDict()  # releases that other replicas requested
         self._released: OrderedDict[str, float] = OrderedDict()  # time of release by session, s
         self._leaving: dict[str, asyncio.Future[None]] = {}  # sessions being given away, until another replica has them

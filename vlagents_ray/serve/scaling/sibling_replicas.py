@@ -78,8 +78,7 @@ class _Sibling(Peer):
     """Another replica: for moving sessions, for pushes of weights (`WeightsReplica`), and for the live page."""
 
     def __init__(self, name: str, actor: Any) -> None:
-        self.name = name
-        self._actor = actor
+        self.name, self._actor = name, actor
 
     async def ask(
         self, method: Callable[Concatenate[HeldSessions, P], Awaitable[T]], *args: P.args, **kwargs: P.kwargs
@@ -111,8 +110,7 @@ class ReplicasInCluster(OtherReplicas):
 
     def __init__(self, apps: Collection[str], but: str = "") -> None:
         """Call the replicas of `apps`, apart from the replica whose full name is `but`."""
-        self._apps = apps
-        self._but = but
+        self._apps, self._but = apps, but
         self._views: dict[str, SnapshotReader] = {}  # result of the last lookup
         self._found = float("-inf")
 
