@@ -179,7 +179,11 @@ class RouteDialect(Dialect):
 
     def routes(self) -> list[BaseRoute]:
         """Return the routes of the dialect's paths, without the root."""
-        return [_route(getattr(self, method), *path.split()) for path, method in self.paths.items()]
+        served = ((*path.split(), getattr(self, name)) for path, name in self.paths.items())
+        return [
+            WebSocketRoute(path, handler) if method == "WS" else Route(path, handler, methods=[method])
+            for method, path, handler in served
+        ]
 
     def at_root(self, sharing: Sequence[Any]) -> Stream:
         """Serve WebSockets at the server's root for all dialects with this protocol there, beginning with this one."""
@@ -255,10 +259,6 @@ class PortDialect(Dialect):
     @abc.abstractmethod
     def close(self) -> None:
         """Stop accepting clients, and end all sessions."""
-
-
-def _route(endpoint: Callable[..., Any], method: str, path: str) -> BaseRoute:
-    return WebSocketRoute(path, endpoint) if method == "WS" else Route(path, endpoint, methods=[method])
 
 
 async def decoded(read: Callable[[bytes, Budget], T], data: bytes | None, admission: MessageAdmission) -> T:

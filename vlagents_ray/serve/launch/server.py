@@ -402,7 +402,11 @@ def wait_until_ready(
         for name in apps:
             app = status.get(name)
             if app is not None and app.status in ("DEPLOY_FAILED", "UNHEALTHY"):
-                raise ConfigError(f"application {name!r} failed to deploy: {_reason(app)}")
+                # The last line of Serve's message is the error below its traceback.
+                texts = [app.message, *(d.message for d in app.deployments.values())]
+                lines = [line.strip() for text in texts for line in (text or "").splitlines() if line.strip()]
+                reason = lines[-1] if lines else "Serve gives no reason"
+                raise ConfigError(f"application {name!r} failed to deploy: {reason}")
         if all(name in status and status[name].status == "RUNNING" for name in apps):
             break
         if time.monotonic() > deadline:
@@ -451,10 +455,3 @@ def _http_reason(url: str) -> str | None:
         return f"HTTP {error.code}"
     except OSError as error:
         return str(error)
-
-
-def _reason(app: Any) -> str:
-    """Return the last line of Serve's message about a failure, which is the error below its traceback."""
-    texts = [app.message, *(d.message for d in app.deployments.values())]
-    lines = [line.strip() for text in texts for line in (text or "").splitlines() if line.strip()]
-    return lines[-1] if lines else "Serve gives no reason"

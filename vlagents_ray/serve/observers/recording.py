@@ -178,7 +178,7 @@ class SessionRecorder(Observer):
         each_half_second.remove(self._look)
         until = time.monotonic() + _CLOSING_S
         self._copier.close(_CLOSING_S)
-        self._worker.put(self._complete)
+        self._worker.put(partial(self._write, self._writer.close))
         self._worker.close(max(0.0, until - time.monotonic()))
 
     def count_held(self, size: int) -> None:
@@ -211,16 +211,8 @@ class SessionRecorder(Observer):
         try:
             write()
         except (OSError, RecordingEnded) as error:
-            self._end(error)
-
-    def _end(self, error: Exception) -> None:
-        """End the recording, without ending any session."""
-        self.ended = str(error)
-        logger.error("recording has ended, and the sessions go on: %s", error)
-        self._writer.close()
-
-    def _complete(self) -> None:
-        if self.ended is None:
+            self.ended = str(error)
+            logger.error("recording has ended, and the sessions go on: %s", error)  # noqa: TRY400 - it says why
             self._writer.close()
 
     def _handle(self, recorded: _Recorded, reply: Reply) -> None:

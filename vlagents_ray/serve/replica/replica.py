@@ -117,9 +117,10 @@ class PolicyReplica(ClientApi, SiblingApi):
 
         # The endpoints.
         has_files = hasattr(os, "memfd_create")
-        self._local = ShmServer(self._engine, self._limits, self._admit()) if has_files else None
+        admit: Admit | NoKey = NoKey.OPEN if self._keys is None else partial(self._keys.check, app=self._app)
+        self._local = ShmServer(self._engine, self._limits, admit) if has_files else None
         self._plasma = PlasmaServer(self._engine, self._limits) if has_files else None
-        self._stream = self._stream_endpoint()
+        self._stream = _stream_endpoint(self._engine, settings, admit) if settings.stream.enabled else None
         self._opened = True
         for endpoint in (self._local, self._plasma, self._stream):
             if endpoint is not None:
@@ -143,14 +144,6 @@ class PolicyReplica(ClientApi, SiblingApi):
         if self._configured:
             return
         self._configured = True
-        await self._load_policy()
-        await self._catch_up()  # gets the other replicas' versions before this replica is ready
-        works = [self._watch_shutdown(), self._keep_catching_up(), self._rebalancer.run()]
-        if self._gateway is not None:
-            works.append(self._poll_gateways())
-        self._tasks = [asyncio.ensure_future(work) for work in works]
-
-    async def _load_policy(self) -> None:
         try:
             await asyncio.to_thread(self._engine.start)
         except PolicyFailed as error:
@@ -159,6 +152,11 @@ class PolicyReplica(ClientApi, SiblingApi):
             logger.exception("the policy did not load")
             # Errors of this package contain the remedy; without this, `serve status` would show both tracebacks first.
             raise PolicyFailed(str(error)) from None
+        await self._catch_up()  # gets the other replicas' versions before this replica is ready
+        works = [self._watch_shutdown(), self._keep_catching_up(), self._rebalancer.run()]
+        if self._gateway is not None:
+            works.append(self._poll_gateways())
+        self._tasks = [asyncio.ensure_future(work) for work in works]
 
     async def close(self) -> None:
         """Close everything: first the sources of requests, then the engine, then its observers, and last the endpoints.
@@ -211,25 +209,6 @@ class PolicyReplica(ClientApi, SiblingApi):
         ]
         inside = build_http_app(self._engine, self.metadata, self._limits, self._metadata_for_machine, more)
         return AccessMiddleware(inside, self._keys, self._app, slow_s=slow_s, idle_s=idle_s, hosts=hosts)
-
-    def _admit(self) -> Admit | NoKey:
-        """Return the check of keys at the replica's own ports, or the reason why none is needed."""
-        return NoKey.OPEN if self._keys is None else partial(self._keys.check, app=self._app)
-
-    def _stream_endpoint(self) -> WebSocketServer | None:
-        stream = self._args.stream
-        if not stream.enabled:
-            return None
-        return WebSocketServer(
-            self._engine,
-            self._limits,
-            _plain_host(),
-            stream.ports,
-            self._admit(),
-            slow_s=self._args.limits.slow_s,
-            idle_s=self._args.sessions.idle_s,
-            hosts=self._args.access.hosts,
-        )
 
     def metadata(self) -> dict[str, Any]:
         """Return the document of `GET /v1/metadata` and `RemoteAgent.metadata`."""
@@ -406,6 +385,12 @@ def _engine(args: ServerArgs, limits: Limits, migrator: SessionMigrator) -> Engi
         in_flight_bytes=limits.in_flight_bytes,
         finder=migrator,
     )
+
+
+def _stream_endpoint(engine: Engine, args: ServerArgs, admit: Admit | NoKey) -> WebSocketServer:
+    slow_s, idle_s, hosts = args.limits.slow_s, args.sessions.idle_s, args.access.hosts
+    host, ports, limits = _plain_host(), args.stream.ports, args.limits.limits()
+    return WebSocketServer(engine, limits, host, ports, admit, slow_s=slow_s, idle_s=idle_s, hosts=hosts)
 
 
 def hide_gpus(given: Sequence[str]) -> None:

@@ -280,7 +280,7 @@ class SessionMigrator:
             self._unannounced[session_id] = step
             if len(self._unannounced) > 1:
                 return
-        self._loop.call_soon_threadsafe(lambda: self._loop.call_later(_GATHER_S, self._announce_all))
+        self._loop.call_soon_threadsafe(lambda: self._spawn(self._announce_all()))
 
     async def hand_over(self) -> int:
         """Give all sessions to other replicas, since this one stops, and close the queue.
@@ -427,15 +427,12 @@ class SessionMigrator:
             logger.info("another replica does not answer: %r", error)
             return None
 
-    def _announce_all(self) -> None:
+    async def _announce_all(self) -> None:
+        await asyncio.sleep(_GATHER_S)
         with self._lock:
             begun, self._unannounced = self._unannounced, {}
-        if not self._closed:
-            self._spawn(self._drop_older_at_peers(begun))
-
-    async def _drop_older_at_peers(self, steps: dict[str, int]) -> None:
-        for peer in await self._peers():
-            self._spawn(self._answer(peer.ask(HeldSessions.drop_older, steps)))
+        for peer in [] if self._closed else await self._peers():
+            self._spawn(self._answer(peer.ask(HeldSessions.drop_older, begun)))
 
     def _finish(self, session_id: str) -> None:
         with self._lock:
