@@ -1,8 +1,8 @@
-"""openpi's clients over WebSocket: requests and replies are binary maps, and the server sends the first message.
+"""openpi's and RoboArena's clients over WebSocket: requests and replies are binary maps; the server sends first.
 
-RoboArena's clients (`roboarena.py`) use nearly the same protocol and also connect to the root. Both dialects may be on:
-RoboArena's requests name an `endpoint`, openpi's do not. The first message is then RoboArena's configuration, which
-openpi's client takes for metadata.
+RoboArena's clients use nearly the same protocol and also connect to the root. Both dialects may be on: RoboArena's
+requests name an `endpoint`, openpi's do not. The first message is then RoboArena's configuration, which openpi's client
+takes for metadata.
 
 An error is a text with a request id, after which the connection is closed (1011) except for 429; openpi's own server
 sends a traceback.
@@ -19,14 +19,14 @@ import time
 import uuid
 from collections.abc import Mapping, Sequence
 from functools import partial
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Literal
 
 import numpy as np
 from pydantic import Field
 from starlette.websockets import WebSocket, WebSocketDisconnect
 
 from vlagents_ray.errors import MalformedMessage, TooManyRequests, VLAgentsError, shown
-from vlagents_ray.protocol.messages import Reply
+from vlagents_ray.protocol.messages import NAME_CHARACTERS, Reply
 from vlagents_ray.serve.config.dialects import DialectConfig, MappingSetting
 from vlagents_ray.serve.dialects import base
 from vlagents_ray.serve.endpoints.http_messages import public_problem
@@ -34,7 +34,6 @@ from vlagents_ray.serve.engine.admission import MessageAdmission
 from vlagents_ray.serve.engine.sender import REFUSED, Sender
 from vlagents_ray.serve.requests import Message
 from vlagents_ray.wire import openpi
-from vlagents_ray.wire.openpi import PRESETS
 
 
 class MapDialect(base.RouteDialect):
@@ -116,7 +115,7 @@ class OpenPiDialect(MapDialect):
         "text, then close 1011."
     )
     paths: ClassVar[Mapping[str, str]] = {"WS /openpi": "stream"}
-    presets = PRESETS
+    presets = openpi.PRESETS
     config: OpenPiDialectConfig
 
     def first(self) -> dict[str, Any]:
@@ -141,6 +140,61 @@ class OpenPiDialect(MapDialect):
         if not isinstance(batch, list) or not batch:
             raise MalformedMessage(f"batch: got {shown(batch)}, want a list of one observation or more")
         return batch
+
+
+class RoboArenaDialectConfig(DialectConfig):
+    """The settings of RoboArena's client; except for `bare`, the fields are those of its PolicyServerConfig."""
+
+    mapping: MappingSetting = "roboarena"
+    image_resolution: tuple[int, int] | None = Field(default=(224, 224), description="height, width; null: any")
+    needs_wrist_camera: bool = True
+    n_external_cameras: int = Field(default=1, ge=0, le=2)
+    needs_stereo_camera: bool = False
+    needs_session_id: bool = False
+    action_space: Literal["joint_position", "joint_velocity", "cartesian_position", "cartesian_velocity"] = (
+        "joint_position"
+    )
+    bare: bool = Field(default=False, description="answer the array itself, as older clients want it")
+
+
+class RoboArenaDialect(MapDialect):
+    """RoboArena's protocol: an episode ends with `reset`, or with another `session_id`."""
+
+    Config = RoboArenaDialectConfig
+    clients = "RoboArena"
+    summary = (
+        "A session is the connection; `reset` or a new `session_id` begins an episode. An error is a text, "
+        "then close 1011."
+    )
+    paths: ClassVar[Mapping[str, str]] = {"WS /roboarena": "stream"}
+    presets = openpi.ROBOARENA
+    config: RoboArenaDialectConfig
+
+    def first(self) -> dict[str, Any]:
+        ours = {"mapping", "rank", "bare"}
+        return self.config.model_dump(mode="json", include=RoboArenaDialectConfig.model_fields.keys() - ours)
+
+    def speaks(self, message: dict[str, Any]) -> bool:
+        return "endpoint" in message
+
+    def begins(self, message: dict[str, Any], connection: MapConnection) -> bytes | str | None:
+        endpoint = message.get("endpoint", "infer")
+        if not isinstance(endpoint, str) or endpoint not in ("infer", "reset"):
+            raise MalformedMessage(f"endpoint: got {shown(endpoint)}, want 'infer' or 'reset'")
+        if endpoint == "reset":
+            connection.end_episodes()
+            return "reset successful"
+        if (named := message.get("session_id")) is not None:
+            if isinstance(named, np.ndarray) and named.size == 1:  # the client sends a text, or an array with one text
+                named = named.item()
+            episode = shown(named, NAME_CHARACTERS)
+            if connection.episode not in (None, episode):
+                connection.end_episodes()
+            connection.episode = episode
+        return None
+
+    def answer(self, replies: Sequence[Reply], before_ms: float | None, *, batched: bool) -> Any:
+        return self.rows(replies[0]) if self.config.bare else super().answer(replies, before_ms, batched=batched)
 
 
 class MapConnection:
