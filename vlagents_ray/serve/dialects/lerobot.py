@@ -111,10 +111,7 @@ class LeRobotConnection(GatewayClient):
         """Store an observation for the next act, in place of an earlier one that the policy has not received yet.
 
         An observation of a time step that the policy has received is ignored, unless the client has no action left.
-
-        Args:
-            data: The pickle.
-            admission: The admission of the message, which is released when the observation is dropped or acted on.
+        The `admission` of the pickle is released when the observation is dropped or acted on.
         """
         if self._robot is None:
             raise NotReset("SendPolicyInstructions: got none since Ready; start the client again")

@@ -69,12 +69,7 @@ class Acceptor:
     """Accepts connections; errors (an aborted connection, EMFILE) never stop the listener."""
 
     def __init__(self, listener: socket.socket, on_connection: Callable[[socket.socket], None]) -> None:
-        """Prepare to accept.
-
-        Args:
-            listener: The listening socket.
-            on_connection: Called with each connection, which is non-blocking; it must close those that it refuses.
-        """
+        """Prepare to accept; `on_connection` gets non-blocking connections, and must close those that it refuses."""
         self._listener, self._on_connection = listener, on_connection
         # Without a free descriptor a client could not even be refused, and the listener would stay readable.
         self._spare = _descriptor()
@@ -217,9 +212,7 @@ class PolledConnection(ABC):
     def overdue(self, now: float, refusal: Callable[[Caller], str | None]) -> tuple[str, int] | None:
         """Return a reason and a close code if the connection has to end; called periodically, on any thread.
 
-        Args:
-            now: Time, s, of `time.monotonic`.
-            refusal: Returns the reason why a key is no longer valid, or None.
+        `now` is the time of `time.monotonic`, s; `refusal` returns the reason why a key is no longer valid, or None.
         """
         reason = refusal(self.caller) if isinstance(self.caller, Caller) else None
         return None if reason is None else (reason, POLICY_VIOLATION)

@@ -92,10 +92,7 @@ class Pool:
         self._bytes = 0
 
     def lease(self, length: int) -> tuple[bytes, int]:
-        """Lease a channel to a client; this takes milliseconds.
-
-        Args:
-            length: Size of the frames, bytes.
+        """Lease a channel for frames of `length` bytes to a client; this takes milliseconds.
 
         Returns:
             The id of the channel and the maximum size of its frames, bytes.

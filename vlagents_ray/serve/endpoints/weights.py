@@ -62,12 +62,9 @@ class ReceivesWeights(Protocol):
 
 
 def weights_routes(replicas: ReceivesWeights, slow_s: float, *, open_to_network: bool) -> list[BaseRoute]:
-    """Return the routes for new weights.
+    """Return the routes for new weights, each part of which must arrive within `slow_s`, s.
 
-    Args:
-        replicas: The replicas that get the weights.
-        slow_s: Time limit for the next part to arrive, s.
-        open_to_network: Whether other machines reach this server without a key; pushes are then refused.
+    Pushes are refused if the server is `open_to_network`, i.e. if other machines reach it without a key.
     """
     endpoint = _WeightsEndpoint(replicas, slow_s, open_to_network)
     return [

@@ -346,9 +346,7 @@ class Engine:
     def _seek(self, pending: PendingRequest, error: VLAgentsError) -> bool:
         """Search for an act's session at other replicas, and queue the act again; return False if there is no search.
 
-        Args:
-            pending: The act, which fails if its session is not found.
-            error: The error with which it fails.
+        If its session is not found, the act fails with the `error`.
         """
         if self.finder is None or pending.sought or pending.request.op != "act":
             return False

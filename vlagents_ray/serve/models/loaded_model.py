@@ -218,9 +218,7 @@ class Loader:
         """Load a model into `agent`, by default a new one; the agent is closed if it cannot be served.
 
         Args:
-            choice: The choice for which the model is loaded.
-            settings: Settings of the agent.
-            agent: An agent created from these settings, but not initialized yet.
+            agent: An agent created from the `settings`, but not initialized yet.
 
         Raises:
             BaseException: Any error of the agent's initialization, or of the deployment's check of its contract.

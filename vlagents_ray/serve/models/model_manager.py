@@ -212,13 +212,7 @@ class ModelManager:
     """The models of a replica. Thread-safe; it releases its lock before it calls other components."""
 
     def __init__(self, source: Checkpoints, loader: Loader, sessions: SessionTable[LoadedModel]) -> None:
-        """Manage the models of a replica.
-
-        Args:
-            source: The offered checkpoints.
-            loader: Loads the models.
-            sessions: The sessions; those of a model are closed if it is evicted at once.
-        """
+        """Manage the models of a replica; the `sessions` of a model that is evicted at once are closed."""
         self.continues_plans = False  # whether chunks of the deployment's own model continue the executed plan
         self.contract: Contract | None = None  # contract of the deployment's own model that was loaded last
         self.weights: dict[str, Any] | None = None  # weights of the deployment's own model that was loaded last
@@ -345,7 +339,6 @@ class ModelManager:
 
         Args:
             session: The session; it releases the model that it held before.
-            choice: The chosen checkpoint.
             on_loaded: Called if the model has to be loaded or waited for: with None once the session holds it, or with
                 the error.
             is_abandoned: Returns whether the caller no longer waits.

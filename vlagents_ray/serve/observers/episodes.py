@@ -116,11 +116,7 @@ class EpisodeWriter:
     def begin(self, session: str, instruction: str, reset: str = "", weights: str = "") -> None:
         """Begin to record a session, and end its previous episode.
 
-        Args:
-            session: The session's id.
-            instruction: The episode's instruction.
-            reset: The options of the reset, as text; empty if unknown.
-            weights: The checkpoint and weights that act, as text; empty if unknown.
+        The options of the `reset`, and the checkpoint and `weights` that act, are texts; empty if unknown.
         """
         self.end(session)
         if len(self._running) >= _SESSIONS:
