@@ -118,8 +118,7 @@ def gpus_here() -> float:
     """Count the GPUs that Ray would offer on this machine, without starting Ray and without torch."""
     from ray._private.accelerators import get_accelerator_manager_for_resource
 
-    manager = get_accelerator_manager_for_resource("GPU")
-    if manager is None:
+    if (manager := get_accelerator_manager_for_resource("GPU")) is None:
         return 0.0
     visible = manager.get_current_process_visible_accelerator_ids()  # from CUDA_VISIBLE_DEVICES and similar variables
     found = manager.get_current_node_num_accelerators()
@@ -244,8 +243,7 @@ def long_polls(client: Any) -> Iterator[Any]:
     from ray.serve._private.router import SharedRouterLongPollClient
 
     for handle in client.handle_cache.values():
-        router = getattr(handle._router, "_asyncio_router", None)
-        if router is not None:
+        if (router := getattr(handle._router, "_asyncio_router", None)) is not None:
             yield router.long_poll_client
             yield SharedRouterLongPollClient.get_or_create(client._controller, router._event_loop).long_poll_client
 

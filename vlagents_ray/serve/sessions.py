@@ -120,8 +120,7 @@ class SessionTable(Generic[M]):
 
     def get(self, session_id: str) -> Session[M]:
         """Return the session, and mark it used; raise `UnknownSession` if it is not here."""
-        session = self._sessions.get(session_id)
-        if session is None:
+        if (session := self._sessions.get(session_id)) is None:
             raise UnknownSession(
                 f"session {session_id!r}: unknown here; it was never reset, idled for {self._idle_s:g} s, "
                 f"or its replica was replaced: send a reset first"
@@ -137,8 +136,7 @@ class SessionTable(Generic[M]):
             TooManyRequests: The key of the origin's caller has reached its limit of sessions.
         """
         with self._lock:
-            session = self._sessions.get(session_id)
-            if session is None:
+            if (session := self._sessions.get(session_id)) is None:
                 if origin.caller is not None and (most := origin.caller.sessions) is not None:
                     self._require_below(origin.prefix, most)
                 if len(self._sessions) >= self.limit:
@@ -296,8 +294,7 @@ class SessionTable(Generic[M]):
             self._forget(session_id)
 
     def _forget(self, session_id: str, left: Version | None = None) -> None:
-        session = self._sessions.pop(session_id, None)
-        if session is not None:
+        if (session := self._sessions.pop(session_id, None)) is not None:
             self._remember(session_id, left or (session.steps, _ANY))
             self._ended(session)
 

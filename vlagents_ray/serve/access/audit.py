@@ -65,8 +65,7 @@ class Audit:
         """Return the suffix of the line to log, or None if such an event was logged within `_EVERY_S`."""
         now = time.monotonic()
         with self._lock:
-            kind = self._kinds.get((name, what))
-            if kind is None:
+            if (kind := self._kinds.get((name, what))) is None:
                 self._kinds[name, what] = _Kind(now)
                 return ""
             if now - kind.logged < _EVERY_S:

@@ -39,8 +39,7 @@ class Gateway:
 
     def _open(self, args: ServerArgs) -> None:
         wanted = args.dialects.gateways()
-        keys = args.access.keys()
-        if keys is not None:
+        if (keys := args.access.keys()) is not None:
             write_audit()
         for one in wanted.values():
             require_access(one.host or LOOPBACK, keys, args.access.insecure)

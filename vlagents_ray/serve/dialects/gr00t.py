@@ -301,8 +301,7 @@ class GR00TDialect(PortDialect):
             self._take(tuple(envelope), payload, parts[-1].get(zmq.SRCFD))
 
     def _take(self, envelope: Envelope, payload: bytes, descriptor: int) -> None:
-        client = self._clients.get(envelope)
-        if client is None:
+        if (client := self._clients.get(envelope)) is None:
             answer = partial(self.answer, envelope)
             try:
                 client = self._clients.add(envelope, lambda: GR00TConnection(self.context, self.mapping, answer))

@@ -310,8 +310,7 @@ class LeRobotDialect(PortDialect):
     @contextlib.contextmanager
     def _client(self, context: Any) -> Iterator[LeRobotConnection]:
         """Yield the client of a request, identified by its connection."""
-        client = self._clients.get(context.peer())
-        if client is None:
+        if (client := self._clients.get(context.peer())) is None:
             raise NotReset("Ready: got none over this connection, or it was idle for too long; start the client again")
         with client.request():
             yield client

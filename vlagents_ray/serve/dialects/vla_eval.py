@@ -81,8 +81,7 @@ class VlaEvalDialect(base.RouteDialect):
         reading = asyncio.ensure_future(inbox.fill(socket, gate, self))
         try:
             while (received := await inbox.next()) is not None:
-                answer = await self._answer(received, session, chunk)
-                if answer is not None:
+                if (answer := await self._answer(received, session, chunk)) is not None:
                     await socket.send_bytes(vla_eval.encode(answer))
             if inbox.end is not None:
                 await socket.close(base.POLICY_VIOLATION, inbox.end)

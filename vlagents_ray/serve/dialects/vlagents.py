@@ -150,8 +150,7 @@ class VlagentsConnection:
 
     def _ours(self, obs: Obs) -> Obs:
         """Return the observation under the policy's names, converted if the deployment has a mapping."""
-        mapping = self._dialect.stated_mapping
-        if mapping is None:
+        if (mapping := self._dialect.stated_mapping) is None:
             return obs
         theirs: dict[str, Any] = {"cameras": obs.cameras, "state": obs.state, "info": obs.info}
         if obs.gripper is not None:
@@ -167,8 +166,7 @@ class VlagentsConnection:
         if header is None:
             return None
         length, compressed = rpyc.read_header(header, self._context.limits.body_bytes)
-        body = self._read(length, _FRAME_S, time.monotonic() + _FRAME_S)
-        if body is None:
+        if (body := self._read(length, _FRAME_S, time.monotonic() + _FRAME_S)) is None:
             raise ConnectionResetError("the client disconnected within a message")
         return body, compressed
 
@@ -183,8 +181,7 @@ class VlagentsConnection:
             if left_s <= 0:
                 raise MessageTooLarge("a message took longer than a client may take")
             self._connection.settimeout(left_s)
-            more = self._connection.recv(min(length - len(data), 2**20))
-            if not more:
+            if not (more := self._connection.recv(min(length - len(data), 2**20))):
                 if data:
                     raise ConnectionResetError("the client disconnected within a message")
                 return None
@@ -288,11 +285,9 @@ class SharedMemory:
         self._open.clear()
 
     def _descriptor(self, name: str) -> int:
-        match = _NAME.fullmatch(name)
-        if match is None:
+        if (match := _NAME.fullmatch(name)) is None:
             raise InvalidObservation(f"shared memory: got the name {name[:40]!r}, want one like 'psm_01234567'")
-        known = self._open.get(match[1])
-        if known is not None:
+        if (known := self._open.get(match[1])) is not None:
             return known
         try:
             descriptor = os.open(f"{_FOLDER}/{match[1]}", os.O_RDONLY | os.O_NOFOLLOW | os.O_CLOEXEC | os.O_NONBLOCK)

@@ -81,8 +81,7 @@ class Admission:
         with self._lock:
             if self._closed:
                 raise PolicyUnavailable("the replica is stopping; connect again")
-            threads = self._threads.get(robot)
-            if threads is None:
+            if (threads := self._threads.get(robot)) is None:
                 number = max(1, thread_map.allowed() - 1 if robot else thread_map.allowed() // 2)
                 name = f"decode-{'robots' if robot else 'others'}"
                 threads = self._threads[robot] = ThreadPoolExecutor(number, name)

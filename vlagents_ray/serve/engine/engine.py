@@ -231,8 +231,7 @@ class Engine:
 
         This is called several times a second, on a thread that makes no calls of the policy.
         """
-        call = self.calls.overdue()
-        if call is None:
+        if (call := self.calls.overdue()) is None:
             if self._hung is not None:
                 logger.warning("the policy has returned from %r after all", self._hung.op)
                 self._hung = None

@@ -51,8 +51,7 @@ class _Shared:
 
     def add(self, obj: Any) -> int:
         """Add an object to the shared ones, and return its index."""
-        number = self.numbers.get(id(obj))
-        if number is None:
+        if (number := self.numbers.get(id(obj))) is None:
             number = self.numbers[id(obj)] = len(self.objects)
             self.objects.append(obj)
         return number

@@ -160,8 +160,7 @@ class LoadedModel:
 
         Calls with the same `op` and `kind` take similarly long, and never run on two threads at once.
         """
-        call = self._calls_by_kind.get((op, kind))
-        if call is None:
+        if (call := self._calls_by_kind.get((op, kind))) is None:
             call = self._calls_by_kind[op, kind] = PolicyCall(self.calls, op)
         return call
 

@@ -159,8 +159,7 @@ class ModelCache:
         for model in idle:
             if not self.offers(model.choice, model.settings):
                 return EvictTask(model.key)
-        wanted = self._most_wanted()
-        if wanted is None:
+        if (wanted := self._most_wanted()) is None:
             return None
         task, since = wanted
         limit = self._source.limit
@@ -349,8 +348,7 @@ class ModelManager:
         with self._changed:
             self._require_open()
             self.release_model(session)
-            model = self._cache.free(choice)
-            if model is not None and not session.over:
+            if (model := self._cache.free(choice)) is not None and not session.over:
                 return self._cache.assign(session, model)
             self._cache.waiting.append(Waiter(session, choice, on_loaded, is_abandoned))
             self._wake()
@@ -368,8 +366,7 @@ class ModelManager:
         """
         with self._changed:
             self._require_open()
-            model = self._cache.loaded.get(key_of(settings))
-            if model is not None:
+            if (model := self._cache.loaded.get(key_of(settings))) is not None:
                 return self._cache.assign(session, model)
             if timeout_s <= 0 or not self._cache.offers(choice, settings):
                 raise UnknownSession(f"session {session.id!r}: {choice} is not loaded here; reset it")

@@ -110,8 +110,7 @@ class CommandBoard:
 
     def read_outcomes(self, session_id: str, request: Request) -> None:
         """Read the outcomes of earlier commands that a session's request reports."""
-        held = self._presses.get(session_id)
-        if not held or request.obs is None:
+        if not (held := self._presses.get(session_id)) or request.obs is None:
             return
         stated = request.obs.info.get(COMMANDED)
         outcomes = stated if isinstance(stated, dict) else {}
@@ -127,8 +126,7 @@ class CommandBoard:
 
     def send(self, session_id: str, reply: Reply) -> None:
         """Add the oldest waiting command to the answer to a session's act; "stop" has priority."""
-        held = self._presses.get(session_id)
-        if not held or reply.act is None:
+        if not (held := self._presses.get(session_id)) or reply.act is None:
             return
         with self._lock:
             self._expire(held)

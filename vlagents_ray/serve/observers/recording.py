@@ -169,8 +169,7 @@ class SessionRecorder(Observer):
 
     def on_answer(self, pending: PendingRequest, reply: Reply) -> None:
         """Record the frame of the answered request."""
-        recorded = pending.kept.pop(self, None)
-        if recorded is not None and reply.error is None:
+        if (recorded := pending.kept.pop(self, None)) is not None and reply.error is None:
             self._write_later(partial(self._handle, recorded, reply))
 
     def close(self) -> None:
@@ -298,8 +297,7 @@ def open_recorder(
 
 
 def _frame(recorded: _Recorded, obs: Obs, reply: Reply, first: int) -> RecordedAct:
-    act = reply.act
-    if act is None:
+    if (act := reply.act) is None:
         raise PolicyFailed("the answer has no action")
     info = {key: value for key, value in act.info.items() if key != "timing"}
     version = info.get(POLICY) or {}

@@ -153,8 +153,7 @@ class Child:
 
     def close(self) -> None:
         """Close the policy, and end the process."""
-        process = self._process
-        if process is None or self._closed:
+        if (process := self._process) is None or self._closed:
             return
         self._closed = True
         self._left.put(None)
