@@ -62,7 +62,7 @@ from vlagents_ray.errors import (
 from vlagents_ray.interface import Obs
 from vlagents_ray.protocol.frames import Decoded
 from vlagents_ray.protocol.messages import DEFAULT_LIMITS, SESSION_HEADER, Budget, Limits, Op, RankName, Reply, Request
-from vlagents_ray.serve.access.api_keys import Caller, Identity, NoKey, current_caller
+from vlagents_ray.serve.access.api_keys import Identity, NoKey, caller_name, current_caller
 from vlagents_ray.serve.config.dialects import DialectConfig, KeylessPortConfig, PortConfig, read_mapping
 from vlagents_ray.serve.endpoints.http_messages import (
     LONG_BYTES,
@@ -74,7 +74,7 @@ from vlagents_ray.serve.endpoints.http_messages import (
 )
 from vlagents_ray.serve.engine.admission import Admission, MessageAdmission
 from vlagents_ray.serve.engine.engine import Engine
-from vlagents_ray.serve.engine.sender import Sender
+from vlagents_ray.serve.engine.sender import Sender, settle
 from vlagents_ray.serve.ports import LOOPBACK
 from vlagents_ray.serve.requests import Message
 
@@ -494,13 +494,8 @@ class HttpDialect(RouteDialect):
 
     async def _fetch(self, session_id: str) -> None:
         """Fetch a session of a client that another replica has served so far, with its state."""
-        engine, caller = self.context.engine, current_caller()
-        if engine.finder is None or session_id in engine.sessions:
-            return
-        loop, over = asyncio.get_running_loop(), asyncio.Event()
-
-        def finished() -> None:
-            loop.call_soon_threadsafe(over.set)
-
-        if engine.finder.fetch(session_id, finished, caller.name if isinstance(caller, Caller) else ""):
-            await over.wait()
+        engine = self.context.engine
+        if engine.finder is not None and session_id not in engine.sessions:
+            over: asyncio.Future[None] = asyncio.get_running_loop().create_future()
+            if engine.finder.fetch(session_id, partial(settle, over, None), caller_name()):
+                await over

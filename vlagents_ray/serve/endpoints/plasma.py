@@ -131,11 +131,6 @@ class Pool:
         with self._lock:
             self._return_channel(channel)
 
-    def counts(self) -> tuple[int, int]:
-        """Return the number of free channels and the size of all channels, bytes."""
-        with self._lock:
-            return len(self._free), self._bytes
-
     def _return_channel(self, channel: Channel) -> None:
         if channel.intact():
             self._free.append(channel)

@@ -38,15 +38,10 @@ class Admission:
 
     def __init__(self, in_flight_bytes: int) -> None:
         self._limit = in_flight_bytes
-        self._held = 0
+        self.held = 0  # number of bytes in flight
         self._lock = threading.Lock()
         self._threads: dict[bool, ThreadPoolExecutor] = {}  # the thread pools for robots and (False) for others
         self._closed = False
-
-    @property
-    def held(self) -> int:
-        """Number of bytes in flight."""
-        return self._held
 
     def hold(self, size: int, robot: bool, message_bytes: int) -> None:
         """Count `size` more bytes as in flight for a message that already holds `message_bytes` bytes.
@@ -57,10 +52,10 @@ class Admission:
         """
         most = self._limit if robot else int(self._limit * (1 - _ROBOTS_SHARE))
         with self._lock:
-            if self._held + size <= most:
-                self._held += size
+            if self.held + size <= most:
+                self.held += size
                 return
-            held = self._held
+            held = self.held
         if message_bytes + size > most:
             raise MessageTooLarge(
                 f"message: takes {message_bytes + size} bytes, decoded, and all in flight may take {most}; send fewer "
@@ -74,7 +69,7 @@ class Admission:
     def release(self, size: int) -> None:
         """Count `size` bytes as no longer in flight."""
         with self._lock:
-            self._held -= size
+            self.held -= size
 
     def submit(self, call: Callable[[], T], robot: bool) -> Future[T]:
         """Run `call` on a decoding thread; raise `PolicyUnavailable` after `close`."""
