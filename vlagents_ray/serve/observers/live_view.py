@@ -23,16 +23,8 @@ from vlagents_ray.serve.config.deployment import LiveArgs
 from vlagents_ray.serve.engine.engine import Engine
 from vlagents_ray.serve.engine.metrics_buffer import SAMPLE, STAGES
 from vlagents_ray.serve.models.loaded_model import LoadedModel
+from vlagents_ray.serve.observers import live
 from vlagents_ray.serve.observers.commands import TRACKED_S, CommandBoard
-from vlagents_ray.serve.observers.live import (
-    ENCODING_SHARE,
-    RATE,
-    SHOWN_OPS,
-    VALUES,
-    Answer,
-    KeptObservation,
-    LiveObserver,
-)
 from vlagents_ray.serve.observers.ring import Ring
 from vlagents_ray.serve.periodic import each_half_second
 from vlagents_ray.serve.queue.batch_queue import LoadMeter
@@ -76,7 +68,7 @@ class ReplicaView:
         self._about = {"name": name, "node": node, "ring_s": None if settings is None else settings.ring_s}
         self._metadata = metadata
         self.commands = CommandBoard(engine.sessions, self._save)
-        self.live = LiveObserver(engine.observers, self.commands)
+        self.live = live.LiveObserver(engine.observers, self.commands)
         self.ring = None if settings is None else Ring(self.live, engine.sessions, settings, name)
         self._meter = LoadMeter(engine.queue)
         self._slow: dict[str, Any] = {}
@@ -114,26 +106,26 @@ class ReplicaView:
 
         This may take milliseconds, too long for an event loop or the policy's thread.
         """
-        engine, live = self._engine, self.live
-        live.renew()
-        answers = live.answers(since)
+        engine = self._engine
+        self.live.renew()
+        answers = self.live.answers(since)
         snapshot = Snapshot(answers[-1].number if answers else since, {})
-        last = {one.session: one for one in answers if one.op in SHOWN_OPS}
+        last = {one.session: one for one in answers if one.op in live.SHOWN_OPS}
         ids = engine.sessions.ids()
-        live.forget_others(ids)
+        self.live.forget_others(ids)
         self.commands.forget_others(ids)
         held = sorted(engine.sessions.all(), key=lambda one: one.id)[:_SESSIONS]
         sessions = {one.id: _session(one, last.get(one.id)) for one in held}
         begun = time.thread_time()
         self._pictured = {name: self._pictured.get(name, 0) for name in sessions}
         for name in sorted(sessions, key=self._pictured.__getitem__):  # the session first whose pictures are the oldest
-            kept, described = live.observation(name), sessions[name]
+            kept, described = self.live.observation(name), sessions[name]
             described["commands"] = self.commands.of(name)
             if kept is None or kept.number <= since:
                 continue
             snapshot.number = max(snapshot.number, kept.number)
-            described["state"] = {part: _numbers(values[:VALUES]) for part, values in kept.state.items()}
-            if name in shown and time.thread_time() - begun < ENCODING_SHARE / RATE:
+            described["state"] = {part: _numbers(values[: live.VALUES]) for part, values in kept.state.items()}
+            if name in shown and time.thread_time() - begun < live.ENCODING_SHARE / live.RATE:
                 described["pictures"] = _pictures(kept, snapshot.files)
                 if described["pictures"]:
                     self._pictured[name] = kept.number
@@ -176,7 +168,7 @@ class ReplicaView:
         return self._slow
 
 
-def _session(session: Session[LoadedModel], last: Answer | None) -> dict[str, Any]:
+def _session(session: Session[LoadedModel], last: live.Answer | None) -> dict[str, Any]:
     """Describe a session for viewers, with its last answer if that is new."""
     weights = session.weights
     described = {
@@ -191,7 +183,7 @@ def _session(session: Session[LoadedModel], last: Answer | None) -> dict[str, An
     return described if last is None else described | {"rank": last.rank, "last": _act(last)}
 
 
-def _pictures(kept: KeptObservation, files: list[bytes]) -> dict[str, int]:
+def _pictures(kept: live.KeptObservation, files: list[bytes]) -> dict[str, int]:
     """Add the pictures of an observation to `files`, encoding raw pixels; return their indices."""
     found = kept.pictures()
     if sum(map(len, files)) + sum(map(len, found.values())) > PICTURES:
@@ -200,7 +192,7 @@ def _pictures(kept: KeptObservation, files: list[bytes]) -> dict[str, int]:
     return dict(zip(found, range(len(files) - len(found), len(files)), strict=True))
 
 
-def _act(answer: Answer) -> dict[str, Any]:
+def _act(answer: live.Answer) -> dict[str, Any]:
     """Describe an answer for viewers."""
     ms = {name: round(value, 3) for name, value in answer.timing.items()}
     found: dict[str, Any] = {"n": answer.number, "op": answer.op, "ms": ms}
@@ -218,7 +210,7 @@ def _numbers(values: np.ndarray) -> list[Any]:
     return found
 
 
-def _counted(answers: list[Answer]) -> dict[str, Any]:
+def _counted(answers: list[live.Answer]) -> dict[str, Any]:
     """Return the numbers of acts and errors among the answers, the batch sizes of the acts, and their times, ms."""
     acts = [one.timing for one in answers if one.op == "act" and not one.error]
     sample = acts[:: max(1, len(acts) // SAMPLE)]
@@ -337,7 +329,7 @@ class Fleet:
             else:
                 for viewer in self._viewers:
                     viewer.put(snapshots, more)
-            await asyncio.sleep(max(1 / RATE / 2, 1 / RATE - (time.monotonic() - begun)))
+            await asyncio.sleep(max(1 / live.RATE / 2, 1 / live.RATE - (time.monotonic() - begun)))
 
     async def _snapshots(self) -> list[Snapshot]:
         shown = frozenset[str]().union(*(viewer.shown for viewer in self._viewers))
