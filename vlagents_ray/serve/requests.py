@@ -141,7 +141,7 @@ class PendingRequest:
         """Cancel the preparation of the observation, unless it has begun."""
         preparation, self.preparation = self.preparation, None
         if preparation is not None:
-            preparation.cancel()
+            preparation.future.cancel()
 
     def fail(self, error: VLAgentsError) -> None:
         """Deliver an error, unless the request is over."""
