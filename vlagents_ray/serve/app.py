@@ -56,7 +56,22 @@ def application(args: ServerArgs, *, drains: bool = True) -> Application:
     """
     args = args.model_copy(update={"environment": with_process(args.environment)})
     options: dict[str, Any] = {
-        **_options(args),
+        "name": POLICY,
+        "health_check_period_s": 1 if args.environment.process == "child" else 5,  # three failures replace it
+        # A replica that does not reply is frozen, or its policy holds the interpreter's lock: then only these checks
+        # limit the time of a call. Together they take the limit of a call; Serve's default is 95 s for any policy.
+        "health_check_timeout_s": max(_LEAST_ANSWER_S, args.limits.act_s / _FAILURES),
+        # A policy that failed to load once will fail again. While other replicas run, Serve retries forever.
+        "max_constructor_retry_count": 1,
+        "user_config": {},  # settings of the policy that a file states beside `args`; they change without a restart
+        "ray_actor_options": {
+            "num_cpus": args.resources.num_cpus,
+            "num_gpus": args.resources.num_gpus,
+            "resources": args.resources.custom,
+            **({} if args.resources.memory is None else {"memory": args.resources.memory}),
+            # Without this setting, Serve applies the application's.
+            **({"runtime_env": environment} if (environment := args.environment.runtime_env()) else {}),
+        },
         # A WebSocket session counts as a request as long as it lasts, so the limit must allow all sessions and two
         # batches. It is no protection against overload, since requests wait in the batch queue.
         "max_ongoing_requests": args.sessions.limit + 2 * args.batch.max_size,
@@ -81,28 +96,6 @@ def application(args: ServerArgs, *, drains: bool = True) -> Application:
     gateways = args.dialects.gateways()
     settings = args.model_dump(mode="json", exclude=_OUTSIDE | {"dialects": set(gateways)})
     return policy.bind(settings, _gateway(args) if gateways else None)
-
-
-def _options(args: ServerArgs) -> dict[str, Any]:
-    """Return Serve's options that do not depend on the number of replicas."""
-    return {
-        "name": POLICY,
-        "health_check_period_s": 1 if args.environment.process == "child" else 5,  # three failures replace it
-        # A replica that does not reply is frozen, or its policy holds the interpreter's lock: then only these checks
-        # limit the time of a call. Together they take the limit of a call; Serve's default is 95 s for any policy.
-        "health_check_timeout_s": max(_LEAST_ANSWER_S, args.limits.act_s / _FAILURES),
-        # A policy that failed to load once will fail again. While other replicas run, Serve retries forever.
-        "max_constructor_retry_count": 1,
-        "user_config": {},  # settings of the policy that a file states beside `args`; they change without a restart
-        "ray_actor_options": {
-            "num_cpus": args.resources.num_cpus,
-            "num_gpus": args.resources.num_gpus,
-            "resources": args.resources.custom,
-            **({} if args.resources.memory is None else {"memory": args.resources.memory}),
-            # Without this setting, Serve applies the application's.
-            **({"runtime_env": environment} if (environment := args.environment.runtime_env()) else {}),
-        },
-    }
 
 
 def _gateway(args: ServerArgs) -> Application:

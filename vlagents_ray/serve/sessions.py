@@ -110,7 +110,7 @@ class SessionTable(Generic[M]):
         self._idle_s, self._clock = idle_s, clock
         self._drawn = 0  # latest step drawn
         self._left: OrderedDict[str, Version] = OrderedDict()  # by session: version up to which its states are refused
-        self._lock = threading.Lock()
+        self._lock = threading.RLock()
 
     def __len__(self) -> int:
         return len(self._sessions)
@@ -140,7 +140,7 @@ class SessionTable(Generic[M]):
                 if origin.caller is not None and (most := origin.caller.sessions) is not None:
                     self._require_below(origin.prefix, most)
                 if len(self._sessions) >= self.limit:
-                    self._drop_idle()
+                    self.drop_idle()
                 if len(self._sessions) >= self.limit:
                     raise self.full()
                 session = self._sessions[session_id] = Session(session_id)
@@ -228,7 +228,7 @@ class SessionTable(Generic[M]):
 
     def _require_below(self, prefix: str, limit: int) -> None:
         if sum(name.startswith(prefix) for name in self._sessions) >= limit:
-            self._drop_idle()
+            self.drop_idle()
         if sum(name.startswith(prefix) for name in self._sessions) >= limit:
             raise TooManyRequests(
                 f"key {prefix.rstrip('/')!r} holds {limit} sessions here, as many as it allows; close one"
@@ -285,13 +285,10 @@ class SessionTable(Generic[M]):
 
     def drop_idle(self) -> None:
         """Close sessions without a request for longer than the idle time."""
-        with self._lock:
-            self._drop_idle()
-
-    def _drop_idle(self) -> None:
         oldest = time.monotonic() - self._idle_s
-        for session_id in [s.id for s in self._sessions.values() if s.used < oldest]:
-            self._forget(session_id)
+        with self._lock:
+            for session_id in [s.id for s in self._sessions.values() if s.used < oldest]:
+                self._forget(session_id)
 
     def _forget(self, session_id: str, left: Version | None = None) -> None:
         if (session := self._sessions.pop(session_id, None)) is not None:

@@ -192,7 +192,6 @@ class Keys:
             self._unreadable = None
 
     def _handle_unreadable(self, error: Exception, now: float) -> None:
-        """Handle a failed attempt to read the file."""
         first = self._unreadable is None
         since = self._unreadable = now if self._unreadable is None else self._unreadable
         self._state = _UNREAD

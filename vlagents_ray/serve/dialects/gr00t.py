@@ -397,7 +397,6 @@ class _Strangers:
 
 
 def _received(connection: socket.socket) -> int:
-    """Return the number of bytes that a connection has received."""
     try:
         info = connection.getsockopt(socket.IPPROTO_TCP, socket.TCP_INFO, _RECEIVED_AT + _RECEIVED.size)
     except OSError:  # the connection has ended

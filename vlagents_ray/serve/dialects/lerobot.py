@@ -261,10 +261,10 @@ class LeRobotDialect(PortDialect):
             "GetActions": unary(partial(self._answer, grpc, self._act)),
         }
 
-    def _answer(self, grpc: Any, method: Callable[[Any, Any], bytes], request: Any, context: Any) -> bytes:
+    def _answer(self, grpc: Any, method: Callable[[Any, Any], bytes | None], request: Any, context: Any) -> bytes:
         """Return the reply to a request, or end the request with gRPC's status for the error."""
         try:
-            return method(request, context)
+            return method(request, context) or lerobot.EMPTY
         except VLAgentsError as error:
             status, text = _STATUS.get(error.status, "INTERNAL"), f"{error.code}: {error}"
         except Exception as error:  # noqa: BLE001 - logged, and answered
@@ -274,23 +274,21 @@ class LeRobotDialect(PortDialect):
         context.abort(getattr(grpc.StatusCode, status), text[:_DETAILS])
         raise AssertionError  # abort raises
 
-    def _ready(self, _: bytes, context: Any) -> bytes:
+    def _ready(self, _: bytes, context: Any) -> None:
         if self._closing.is_set():
             raise PolicyUnavailable("the server is stopping; connect again")
         if self._ipv4 and context.peer().startswith("ipv6:"):  # gRPC also listens there if the host is 0.0.0.0
             raise Forbidden("this server is for IPv4; connect to such an address, or set dialects.lerobot.host to '::'")
         make = partial(LeRobotConnection, self.context, self.mapping, self.config.checkpoint)
         self._clients.add(context.peer(), make)
-        return lerobot.EMPTY
 
-    def _set_up(self, message: bytes, context: Any) -> bytes:
+    def _set_up(self, message: bytes, context: Any) -> None:
         with self._client(context) as client:
             if (data := lerobot.read_data(message)) is None:
                 raise MalformedMessage("policy instructions: got none")
             client.set_up(lerobot.read_instructions(data, self.context.limits))
-        return lerobot.EMPTY
 
-    def _observe(self, parts: Iterator[bytes], context: Any) -> bytes:
+    def _observe(self, parts: Iterator[bytes], context: Any) -> None:
         with self._client(context) as client:
             robot = self.config.rank == "robot"
             admission = MessageAdmission(self.context.admission, self.context.limits, None, robot=robot, inline=False)
@@ -300,12 +298,11 @@ class LeRobotDialect(PortDialect):
             finally:
                 del self._uploads[context]
             client.observe(data, admission)
-        return lerobot.EMPTY
 
-    def _act(self, _: bytes, context: Any) -> bytes:
+    def _act(self, _: bytes, context: Any) -> bytes | None:
         with self._client(context) as client:
             actions = client.actions()
-        return lerobot.EMPTY if actions is None else lerobot.write_data(actions)
+        return None if actions is None else lerobot.write_data(actions)
 
     @contextlib.contextmanager
     def _client(self, context: Any) -> Iterator[LeRobotConnection]:

@@ -175,7 +175,7 @@ class PlasmaServer(UnixServer):
         self._path = folder / f"vla{secrets.token_hex(4)}"
         self.plasma = PlasmaAddress(str(self._path), ray.get_runtime_context().get_node_id())
 
-    def listen(self) -> None:
+    def open(self) -> None:
         """Listen, then give the socket its name; remove the sockets of killed replicas."""
         for other in self._path.parent.glob("vla????????"):
             _remove_if_dead(other)
@@ -184,6 +184,7 @@ class PlasmaServer(UnixServer):
         hidden.chmod(0o600)
         self._listener.listen(BACKLOG)
         hidden.rename(self._path)
+        super().open()
 
     def close(self) -> None:
         """Close the listener and all connections, and remove the socket; call this after the engine has ended."""

@@ -19,7 +19,6 @@ import socket
 import struct
 import time
 import weakref
-from abc import abstractmethod
 from array import array
 from collections.abc import Callable, Sequence
 from functools import partial
@@ -93,15 +92,6 @@ class UnixServer(PolledServer["UnixConnection"]):
         listener = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET | socket.SOCK_NONBLOCK)
         super().__init__(engine, limits, admit, listener)
         self.payload, self.ops = payload, ops
-
-    @abstractmethod
-    def listen(self) -> None:
-        """Bind the socket to its name and listen."""
-
-    def open(self) -> None:
-        """Start to listen; call this before the engine starts."""
-        self.listen()
-        super().open()
 
     def _add_client(self, connection: socket.socket) -> None:
         if peer_uid(connection) != os.getuid():
@@ -260,10 +250,11 @@ class ShmServer(UnixServer):
             f"vlagents-ray-{secrets.token_hex(16)}", boot_id(), keyed=not isinstance(admit, NoKey)
         )
 
-    def listen(self) -> None:
-        """Listen at the address in the metadata."""
+    def open(self) -> None:
+        """Listen at the address in the metadata; call this before the engine starts."""
         self._listener.bind(f"\0{self.address.socket}")
         self._listener.listen(BACKLOG)
+        super().open()
 
 
 class MemoryFiles:

@@ -193,7 +193,6 @@ def _pictures(kept: live.KeptObservation, files: list[bytes]) -> dict[str, int]:
 
 
 def _act(answer: live.Answer) -> dict[str, Any]:
-    """Describe an answer for viewers."""
     ms = {name: round(value, 3) for name, value in answer.timing.items()}
     found: dict[str, Any] = {"n": answer.number, "op": answer.op, "ms": ms}
     if answer.error:
