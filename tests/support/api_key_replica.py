@@ -53,8 +53,7 @@ from vlagents_ray.registry import dialect_class
 from vlagents_ray.serve import periodic
 from vlagents_ray.serve.access import api_keys
 from vlagents_ray.serve.config.dialects import DialectArgs
-from vlagents_ray.serve.dialects.base import GatewayContext, ReplicaContext
-from vlagents_ray.serve.dialects.routes import dialect_routes
+from vlagents_ray.serve.dialects.base import GatewayContext, ReplicaContext, dialect_routes
 from vlagents_ray.serve.endpoints import access_middleware, websocket
 from vlagents_ray.serve.endpoints.access_middleware import AccessMiddleware
 from vlagents_ray.serve.endpoints.http import build_http_app

@@ -46,7 +46,8 @@ import numpy as np
 from starlette.requests import ClientDisconnect
 from starlette.requests import Request as HttpRequest
 from starlette.responses import Response
-from starlette.routing import BaseRoute, Route, WebSocketRoute
+from starlette.routing import BaseRoute, Match, Route, WebSocketRoute
+from starlette.types import Scope
 from starlette.websockets import WebSocket
 
 from vlagents_ray.client.agent import RemoteAgent
@@ -62,8 +63,9 @@ from vlagents_ray.errors import (
 from vlagents_ray.interface import Obs
 from vlagents_ray.protocol.frames import Decoded
 from vlagents_ray.protocol.messages import DEFAULT_LIMITS, SESSION_HEADER, Budget, Limits, Op, RankName, Reply, Request
+from vlagents_ray.registry import dialect_class
 from vlagents_ray.serve.access.api_keys import Identity, NoKey, caller_name, current_caller
-from vlagents_ray.serve.config.dialects import DialectConfig, KeylessPortConfig, PortConfig, read_mapping
+from vlagents_ray.serve.config.dialects import DialectArgs, DialectConfig, KeylessPortConfig, PortConfig, read_mapping
 from vlagents_ray.serve.endpoints.http_messages import (
     LONG_BYTES,
     RequestDecoder,
@@ -259,6 +261,30 @@ class PortDialect(Dialect):
     @abc.abstractmethod
     def close(self) -> None:
         """Stop accepting clients, and end all sessions."""
+
+
+class Root(WebSocketRoute):
+    """The application's root, with or without a slash at its end: `ws://host:port`, `ws://host:port/app`."""
+
+    def matches(self, scope: Scope) -> tuple[Match, Scope]:
+        """Match a WebSocket at the root."""
+        path = scope.get("path", "").removeprefix(scope.get("root_path", ""))
+        if scope["type"] == "websocket" and path in ("", "/"):
+            return Match.FULL, {"endpoint": self.endpoint, "path_params": {}}
+        return Match.NONE, {}
+
+
+def dialect_routes(args: DialectArgs, context: ReplicaContext) -> list[BaseRoute]:
+    """Return the routes of the dialects on the server's own port."""
+    dialects: dict[str, RouteDialect] = {
+        name: dialect_class(name)(name, config, context)
+        for name, config in args.on().items()
+        if name not in args.gateways()
+    }
+    routes = [route for dialect in dialects.values() for route in dialect.routes()]
+    if sharing := [dialects[name] for name in args.at_root()]:
+        routes.append(Root("/", sharing[0].at_root(sharing)))
+    return routes
 
 
 async def decoded(read: Callable[[bytes, Budget], T], data: bytes | None, admission: MessageAdmission) -> T:

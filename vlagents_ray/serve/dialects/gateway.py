@@ -18,7 +18,6 @@ from vlagents_ray.serve.access.api_keys import NoKey, require_access
 from vlagents_ray.serve.access.audit import write_audit
 from vlagents_ray.serve.config.deployment import ServerArgs
 from vlagents_ray.serve.dialects.base import Connect, GatewayContext, PortDialect
-from vlagents_ray.serve.dialects.routes import describe, require_fit
 from vlagents_ray.serve.engine.admission import Admission
 from vlagents_ray.serve.ports import LOOPBACK, reserve
 
@@ -34,7 +33,7 @@ class Gateway:
     async def __init__(self, args: dict[str, Any]) -> None:  # type: ignore[misc]  # Serve awaits it
         self._dialects: list[PortDialect] = []
         settings = ServerArgs(**args)
-        self._description = describe(settings.dialects)
+        self._description = settings.dialects.describe()
         await asyncio.to_thread(self._open, settings)
 
     def _open(self, args: ServerArgs) -> None:
@@ -47,7 +46,7 @@ class Gateway:
         try:
             app = serve.get_replica_context().app_name
             contract = wait_for_policy(app)
-            require_fit(args.dialects, contract)
+            args.dialects.require_fit(contract)
             limits = args.limits.limits()
             admission = Admission(limits.in_flight_bytes)
             for name, one in wanted.items():
@@ -70,7 +69,7 @@ class Gateway:
             raise
 
     async def description(self) -> dict[str, Any]:
-        """Return the description of the dialects for the metadata of replicas, see `describe`."""
+        """Return the description of the dialects for the metadata of replicas, see `DialectArgs.describe`."""
         return self._description
 
     def check_health(self) -> None:

@@ -18,7 +18,6 @@ from vlagents_ray.policies.wrapper import build_agent
 from vlagents_ray.ray_tools.runtime_env import require_no_secrets
 from vlagents_ray.registry import names, policy_class
 from vlagents_ray.serve.config.deployment import POLICY, ServerArgs
-from vlagents_ray.serve.dialects.routes import require_fit, require_packages
 from vlagents_ray.serve.models.checkpoints import CHOICE, STEP, Checkpoints
 from vlagents_ray.serve.python_env.child_main import unloaded_contract
 from vlagents_ray.serve.python_env.probe import check_policy, with_process
@@ -228,13 +227,13 @@ def _require_policy(args: ServerArgs, own: dict[str, Any], *, installed: bool, s
         else:
             with_process(args.environment)
         return
-    require_packages(args.dialects)
+    args.dialects.require_packages()
     offered = args.checkpoints.of(partial(build_agent, args.policy, wrappers=args.wrappers), own)
     for choice in offered.examples():
         settings = offered.settings(choice, offered.config)
         if step_follows and STEP_PLACE in str(settings.get(CHOICE)) and settings.get(STEP) is None:
             settings |= {STEP: 0}
-        require_fit(args.dialects, _contract(args, offered, settings))
+        args.dialects.require_fit(_contract(args, offered, settings))
 
 
 def _contract(args: ServerArgs, offered: Checkpoints, settings: dict[str, Any]) -> Contract | None:

@@ -30,8 +30,7 @@ from vlagents_ray.registry import names
 from vlagents_ray.serve.access.api_keys import NoKey, require_access, warn_of_plain_http
 from vlagents_ray.serve.access.audit import write_audit
 from vlagents_ray.serve.config.deployment import ServerArgs
-from vlagents_ray.serve.dialects.base import ReplicaContext
-from vlagents_ray.serve.dialects.routes import describe, dialect_routes, require_fit
+from vlagents_ray.serve.dialects.base import ReplicaContext, dialect_routes
 from vlagents_ray.serve.endpoints.access_middleware import AccessMiddleware
 from vlagents_ray.serve.endpoints.connection import Admit
 from vlagents_ray.serve.endpoints.http import build_http_app
@@ -227,7 +226,7 @@ class PolicyReplica(ClientApi, SiblingApi):
             "version": importlib.metadata.version("vlagents-ray"),
             "code": None if self._code is None else self._code.to_json(),
             "program": self._program | models.files,
-            "dialects": describe(self._args.dialects) | self._gateways,
+            "dialects": self._args.dialects.describe() | self._gateways,
             "local": None if self._local is None else asdict(self._local.address),
             "stream": None if self._stream is None else asdict(self._stream.address),
         }
@@ -379,7 +378,7 @@ def _engine(args: ServerArgs, limits: Limits, migrator: SessionMigrator) -> Engi
         session_limit=args.sessions.limit,
         session_idle_s=args.sessions.idle_s,
         version=version_of(args),
-        check=partial(require_fit, args.dialects),
+        check=args.dialects.require_fit,
         limits=args.limits.call_limits(),
         reply_bytes=limits.reply_bytes,
         in_flight_bytes=limits.in_flight_bytes,
