@@ -238,16 +238,11 @@ class AccessArgs(_DeploymentModel):
     plain_http: bool = Field(
         default=False, description="keys may cross the network unencrypted: no warning (TLS ends elsewhere, a VPN)"
     )
-    hosts: list[str] = Field(
+    hosts: list[Annotated[str, AfterValidator(str.lower)]] = Field(
         default_factory=list,
         description="without keys: names in the public DNS by which clients reach the server; its addresses, names "
         "without a dot and those of private networks need not be stated",
     )
-
-    @field_validator("hosts")
-    @classmethod
-    def _lower(cls, value: list[str]) -> list[str]:
-        return [host.lower() for host in value]
 
     @model_validator(mode="after")
     def _one(self) -> AccessArgs:

@@ -107,9 +107,6 @@ class VlagentsConnection:
         if call.handler is Handler.INSPECT:
             return tuple((name, None) for name in _METHODS)
         method, args = _called(call)
-        return self._method(method, args)
-
-    def _method(self, method: str, args: tuple[Any, ...]) -> Any:
         if method in ("act", "reset"):
             if len(args) != 1 or not isinstance(args[0], (str, bytes)):
                 raise MalformedMessage(f"{method}: want one argument, text")
