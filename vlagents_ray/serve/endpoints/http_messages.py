@@ -160,7 +160,8 @@ class RequestDecoder:
             try:
                 if size > self._limits.body_bytes:
                     raise MessageTooLarge(f"body: over {self._limits.body_bytes} bytes, the limit")
-                admission.receive(length)
+                if length:
+                    admission.receive(length)
             except VLAgentsError as error:
                 raise _Refused(error) from error
             return message
