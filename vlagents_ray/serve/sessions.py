@@ -88,22 +88,16 @@ class SessionTable(Generic[M]):
     is always above those that the session's client and this replica have seen, even if the clocks are wrong.
     """
 
-    def __init__(
-        self,
-        limit: int,
-        idle_s: float,
-        clock: Callable[[], int] = time.time_ns,
-        ended: Callable[[Session[M]], None] = lambda _: None,
-    ) -> None:
+    def __init__(self, limit: int, idle_s: float, clock: Callable[[], int] = time.time_ns) -> None:
         """Create an empty table.
 
         Args:
             limit: Largest number of sessions.
             idle_s: Time without a request after which a session may be dropped, s.
             clock: Wall clock, ns.
-            ended: Called with each session that is removed, under the table's lock.
         """
-        self._ended = ended
+        # Called with each session that is removed, under the table's lock.
+        self.ended: Callable[[Session[M]], None] = lambda _: None
         self._sessions: dict[str, Session[M]] = {}
         self.limit = limit
         self.opened = 0  # number of sessions opened so far
@@ -168,7 +162,7 @@ class SessionTable(Generic[M]):
             session.expected = session.first
             if session.steps == 0:  # the reset was the session's first one here
                 del self._sessions[session_id]
-                self._ended(session)
+                self.ended(session)
 
     def is_past(self, session_id: str, first: int) -> bool:
         """Return whether the session has passed an episode that was to begin at that step, here or elsewhere."""
@@ -203,7 +197,7 @@ class SessionTable(Generic[M]):
             if here is None:
                 self.opened += 1
             else:
-                self._ended(here)
+                self.ended(here)
             self._sessions[arriving.id] = arriving
 
     def held(self, session_ids: Iterable[str]) -> dict[str, Version]:
@@ -293,7 +287,7 @@ class SessionTable(Generic[M]):
     def _forget(self, session_id: str, left: Version | None = None) -> None:
         if (session := self._sessions.pop(session_id, None)) is not None:
             self._remember(session_id, left or (session.steps, _ANY))
-            self._ended(session)
+            self.ended(session)
 
     def _remember(self, session_id: str, version: Version) -> None:
         self._left[session_id] = max(version, self._left.pop(session_id, version))

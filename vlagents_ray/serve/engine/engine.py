@@ -94,15 +94,11 @@ class Engine:
         """
         self._source = agent if isinstance(agent, Checkpoints) else Checkpoints(lambda _: agent)
         self.clock, self.finder = clock, finder
-        self.sessions: SessionTable[LoadedModel] = SessionTable(
-            session_limit,
-            session_idle_s,
-            wall_clock,
-            lambda session: self.models.release(session),  # noqa: PLW0108
-        )
+        self.sessions: SessionTable[LoadedModel] = SessionTable(session_limit, session_idle_s, wall_clock)
         self.calls, self.pauses = PolicyCalls(limits, clock), PauseDetector(clock)
         loader = Loader(self._source, version, batch_sizes, max_batch_size, check, self.calls)
         self.models = ModelManager(self._source, loader, self.sessions)
+        self.sessions.ended = self.models.release
         self.stats, self.admission = MetricsBuffer(), Admission(in_flight_bytes)
         loader.on_out_of_memory, loader.on_gpu_ms = self.stats.out_of_memory, self.stats.gpu
         self._batch_sizes, self._reply_bytes = batch_sizes, reply_bytes
@@ -129,7 +125,6 @@ class Engine:
         self._answers = ThreadPoolExecutor(1, "policy-answers")
         self._acting = threading.Lock()  # held while the policy's thread runs a batch, and while the policy sleeps
         self.weights = WeightUpdates(lambda: self.models.own_weights, self.sessions.all, self._acting)
-
         self.observers = Observers()
 
     def start(self, *, threaded: bool = True) -> None:
