@@ -114,24 +114,12 @@ class _Recorded:
 class SessionRecorder(Observer):
     """Records a share of the sessions of one replica until `close`."""
 
-    def __init__(
-        self,
-        writer: EpisodeWriter,
-        sessions: SessionTable[LoadedModel],
-        *,
-        share: float = 1.0,
-        held_bytes: int = _HELD_BYTES,
-    ) -> None:
-        """Create a recorder, and start its threads.
-
-        Args:
-            share: Share of the episodes to record, drawn at each reset, in [0, 1].
-            held_bytes: Maximum size of the requests that wait to be written.
-        """
+    def __init__(self, writer: EpisodeWriter, sessions: SessionTable[LoadedModel], *, share: float = 1.0) -> None:
+        """Create a recorder, and start its threads; `share` of the episodes, in [0, 1], is drawn at each reset."""
         self.dropped = 0  # number of acts that exceeded the memory, or whose episode could not be written
         self.ended: str | None = None  # reason why nothing more is recorded
         self._writer, self._sessions = writer, sessions
-        self._share, self._held_bytes = share, held_bytes
+        self._share, self._held_bytes = share, _HELD_BYTES
         self._held = 0
         self._lock = threading.RLock()  # guards `_held`, which the garbage collector may reduce at any time
         self._looking = False  # whether a comparison of the current sessions with `_first` is scheduled

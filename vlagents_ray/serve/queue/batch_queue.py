@@ -162,14 +162,13 @@ class BatchQueue:
         """Return the number of requests that wait for the next batch, by class."""
         return dict(zip(Rank, self._waiting.depth, strict=True))
 
-    def waited_s(self) -> float:
-        """Return the total time that all requests have waited so far, s; its growth rate is the mean queue length."""
-        with self._lock:
-            return self._load_timer.waited_s(self._waiting.size)
+    def load_s(self) -> tuple[float, float]:
+        """Return the total time for which the policy's thread has been idle, and all requests have waited so far, s.
 
-    def idle_time_s(self) -> float:
-        """Return the total time for which the policy's thread has been idle, s; otherwise it was busy."""
-        return self._load_timer.idle_time_s()
+        The growth rate of the latter is the mean queue length.
+        """
+        with self._lock:
+            return self._load_timer.idle_time_s(), self._load_timer.waited_s(self._waiting.size)
 
     def close(self) -> list[PendingRequest]:
         """Refuse further requests, make `next` return None after the running batch, and return the waiting requests."""
@@ -286,11 +285,11 @@ class LoadMeter:
 
     def __init__(self, queue: BatchQueue) -> None:
         self._queue = queue
-        self._last = (time.perf_counter(), queue.idle_time_s(), queue.waited_s())
+        self._last = (time.perf_counter(), *queue.load_s())
 
     def read(self) -> QueueLoad:
         """Return the mean load since the last call, or since the meter was created."""
-        now = (time.perf_counter(), self._queue.idle_time_s(), self._queue.waited_s())
+        now = (time.perf_counter(), *self._queue.load_s())
         elapsed, idle, waited = (b - a for a, b in zip(self._last, now, strict=True))
         self._last = now
         if elapsed <= 0:
