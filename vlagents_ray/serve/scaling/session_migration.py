@@ -431,8 +431,9 @@ class SessionMigrator:
         await asyncio.sleep(_GATHER_S)
         with self._lock:
             begun, self._unannounced = self._unannounced, {}
-        for peer in [] if self._closed else await self._peers():
-            self._spawn(self._answer(peer.ask(HeldSessions.drop_older, begun)))
+        if not self._closed:
+            for peer in await self._peers():
+                self._spawn(self._answer(peer.ask(HeldSessions.drop_older, begun)))
 
     def _finish(self, session_id: str) -> None:
         with self._lock:
