@@ -218,9 +218,16 @@ class LeRobotDialect(PortDialect):
         self._ipv4 = listener.family == socket.AF_INET
         host, port = listener.getsockname()[:2]
         most = _REQUESTS * self.context.sessions
+        unary, stream = grpc.unary_unary_rpc_method_handler, grpc.stream_unary_rpc_method_handler
+        methods = {  # over plain bytes
+            "Ready": unary(partial(self._answer, grpc, self._ready)),
+            "SendPolicyInstructions": unary(partial(self._answer, grpc, self._set_up)),
+            "SendObservations": stream(partial(self._answer, grpc, self._observe)),
+            "GetActions": unary(partial(self._answer, grpc, self._act)),
+        }
         self._server = grpc.server(
             ThreadPoolExecutor(most, "lerobot-client"),
-            handlers=[grpc.method_handlers_generic_handler(lerobot.SERVICE, self._methods(grpc))],
+            handlers=[grpc.method_handlers_generic_handler(lerobot.SERVICE, methods)],
             options=[
                 ("grpc.so_reuseport", 0),  # otherwise another process could share the port
                 ("grpc.max_concurrent_streams", _REQUESTS),
@@ -250,16 +257,6 @@ class LeRobotDialect(PortDialect):
             self._server.stop(None).wait(_END_S)
         if self._thread.is_alive():
             self._thread.join(_END_S)
-
-    def _methods(self, grpc: Any) -> dict[str, Any]:
-        """Return the service's methods, over plain bytes."""
-        unary, stream = grpc.unary_unary_rpc_method_handler, grpc.stream_unary_rpc_method_handler
-        return {
-            "Ready": unary(partial(self._answer, grpc, self._ready)),
-            "SendPolicyInstructions": unary(partial(self._answer, grpc, self._set_up)),
-            "SendObservations": stream(partial(self._answer, grpc, self._observe)),
-            "GetActions": unary(partial(self._answer, grpc, self._act)),
-        }
 
     def _answer(self, grpc: Any, method: Callable[[Any, Any], bytes | None], request: Any, context: Any) -> bytes:
         """Return the reply to a request, or end the request with gRPC's status for the error."""
