@@ -496,11 +496,7 @@ class HttpDialect(RouteDialect):
 
     async def end_episode(self, http: HttpRequest) -> Response:
         """Answer `{}`, and make the next observation of the session in the header begin an episode."""
-        name = request_id(http)
-        try:
-            (await self._kept_session(session_id(http))).episode.end()
-        except VLAgentsError as error:
-            return problem_response(error, name)
+        (await self._kept_session(session_id(http))).episode.end()
         return Response(b"{}", media_type="application/json")
 
     async def _kept_session(self, name: str) -> ImplicitSession:

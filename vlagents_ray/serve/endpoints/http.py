@@ -35,6 +35,7 @@ from vlagents_ray.serve.access.api_keys import current_caller
 from vlagents_ray.serve.endpoints.docs_page import STYLE, docs_page
 from vlagents_ray.serve.endpoints.http_messages import (
     RequestDecoder,
+    answer_error,
     deny,
     headers_of,
     html_response,
@@ -79,7 +80,7 @@ def build_http_app(
             Route("/docs", server.docs),
             *more,
         ],
-        exception_handlers={HTTPException: _http_problem},
+        exception_handlers={HTTPException: _http_problem, VLAgentsError: answer_error},
     )
     app.router.redirect_slashes = False  # many clients drop the body of a redirected POST
     app.router.default = partial(_no_such_path, app.router.default)

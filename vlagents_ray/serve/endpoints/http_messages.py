@@ -10,7 +10,7 @@ import uuid
 from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
-from typing import Any
+from typing import Any, cast
 
 from starlette.exceptions import HTTPException
 from starlette.formparsers import MultiPartException
@@ -250,6 +250,11 @@ def request_id(http: HttpRequest) -> str:
 def named(shown: str) -> str:
     """Return the request id of a header, or a new one if the header is empty, invalid, or could forge a log line."""
     return shown if shown and is_name(shown) else uuid.uuid4().hex
+
+
+async def answer_error(http: HttpRequest, error: Exception) -> Response:
+    """Answer a request whose handler has raised an error of this package."""
+    return problem_response(cast(VLAgentsError, error), request_id(http))
 
 
 async def deny(socket: WebSocket, error: VLAgentsError) -> None:

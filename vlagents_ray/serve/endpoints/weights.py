@@ -32,7 +32,7 @@ from starlette.websockets import WebSocket, WebSocketDisconnect
 from vlagents_ray.errors import InvalidInput, MalformedMessage, MessageTooLarge, Overloaded, VLAgentsError, shown
 from vlagents_ray.protocol.json_messages import problem
 from vlagents_ray.serve.access.api_keys import Caller, ScopeCheck, current_caller
-from vlagents_ray.serve.endpoints.http_messages import deny, problem_response, request_id
+from vlagents_ray.serve.endpoints.http_messages import deny
 from vlagents_ray.serve.weights import PushOptions, PushResult, Rest
 from vlagents_ray.weights.safetensors import MESSAGE_BYTES, ValueSpec, ValuesReader
 
@@ -81,22 +81,16 @@ class _WeightsEndpoint:
         self._receiving = False
 
     async def show(self, http: HttpRequest) -> Response:
-        try:
-            self._scopes.require(_SCOPE)
-            return JSONResponse({"versions": await self._replicas.versions_of_weights()})
-        except VLAgentsError as error:
-            return problem_response(error, request_id(http))
+        self._scopes.require(_SCOPE)
+        return JSONResponse({"versions": await self._replicas.versions_of_weights()})
 
     async def rest(self, http: HttpRequest) -> Response:
-        try:
-            self._scopes.require(_SCOPE)
-            rest = _rest(http.path_params["step"], http.query_params)
-            if isinstance(caller := current_caller(), Caller):
-                caller.note("the policy's rest:", rest.step)
-            await self._replicas.rest(rest)
-            return JSONResponse({})
-        except VLAgentsError as error:
-            return problem_response(error, request_id(http))
+        self._scopes.require(_SCOPE)
+        rest = _rest(http.path_params["step"], http.query_params)
+        if isinstance(caller := current_caller(), Caller):
+            caller.note("the policy's rest:", rest.step)
+        await self._replicas.rest(rest)
+        return JSONResponse({})
 
     async def receive(self, socket: WebSocket) -> None:
         try:
