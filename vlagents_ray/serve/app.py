@@ -13,6 +13,7 @@ from typing import Any
 from pydantic import ValidationError
 from ray import serve
 from ray.serve import Application
+from ray.serve.config import RequestRouterConfig
 from ray.serve.exceptions import RayServeException
 
 from vlagents_ray.errors import VLAgentsError
@@ -84,8 +85,6 @@ def application(args: ServerArgs, *, drains: bool = True) -> Application:
         options["num_replicas"] = args.replicas or 1
     if os.environ.get("RAY_SERVE_ENABLE_HA_PROXY") != "1":
         # HAProxy itself hashes the session header (see haproxy.py) and refuses a custom router.
-        from ray.serve.config import RequestRouterConfig
-
         options["request_router_config"] = RequestRouterConfig(
             request_router_class="vlagents_ray.serve.scaling.router.SessionRouter"
         )

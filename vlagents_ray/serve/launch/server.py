@@ -19,10 +19,13 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+import ray
+from ray import serve
+from ray.serve.exceptions import RayServeException
 from ray.serve.schema import ServeDeploySchema
 
 from vlagents_ray.errors import ConfigError, PolicyUnavailable
-from vlagents_ray.ray_tools import private, session
+from vlagents_ray.ray_tools import head_monitor, private, session
 from vlagents_ray.ray_tools.reaper import MARK
 from vlagents_ray.serve.access.api_keys import require_access, warn_of_plain_http
 from vlagents_ray.serve.config.deployment import AccessArgs, ServerArgs
@@ -55,8 +58,6 @@ def wait_for_proxies(proxies: list[Any], look_again: Callable[[], list[Any]]) ->
     Serve kills a proxy that does not start within some seconds, as on a busy node, and starts another one: `look_again`
     returns the refs of the current ones.
     """
-    import ray
-
     deadline = time.monotonic() + _PROXIES_S
     while True:
         try:
@@ -77,16 +78,12 @@ def shut_down(client: Any) -> None:
     to the whole process group or service, such as systemd's SIGTERM, also ends Ray's head: then Serve can neither
     answer nor continue, and the reaper ends its processes.
     """
-    import ray
-
-    from vlagents_ray.ray_tools.head_monitor import head_is_gone
-
     for poll in private.long_polls(client):  # Ray would report a call in progress at the end as a failed task
         poll.stop()
     client.shutdown_cached_handles()
     last = private.end_controller(client)
     deadline = time.monotonic() + _SHUTDOWN_S
-    while not ray.wait([last], timeout=_LOOK_S)[0] and not head_is_gone():
+    while not ray.wait([last], timeout=_LOOK_S)[0] and not head_monitor.head_is_gone():
         if time.monotonic() > deadline:
             log.warning("Serve has not ended within %g s and is left behind", _SHUTDOWN_S)
             break
@@ -152,9 +149,6 @@ def running_server(
         tls.check()
     for app in our_apps(config):
         keep(*(one.port for one in ServerArgs(**app.args).dialects.gateways().values()))
-    import ray
-    from ray import serve
-
     own = address is None and not ray.is_initialized()
     if own:
         _require_gpus(config, private.gpus_here())
@@ -214,8 +208,6 @@ def deploy(client: Any, config: ServeDeploySchema, *, own: bool, ingress: bool) 
     deployed again, and Serve would replace all replicas of an application that it did not build. Without `ingress`,
     replicas end without waiting for requests, since their clients have already ended.
     """
-    from ray import serve
-
     from vlagents_ray.serve.app import application
 
     stated = [app.model_dump(exclude_defaults=True).keys() for app in config.applications]
@@ -245,8 +237,6 @@ def _require_gpus(config: ServeDeploySchema, here: float | None = None) -> None:
 
 def _missing_gpus(config: ServeDeploySchema, here: float | None = None) -> str | None:
     """Return a sentence about the GPUs that this machine, or the running cluster, lacks; None if it has enough."""
-    import ray
-
     wanted = {app.name: _gpus(ServerArgs(**app.args)) for app in our_apps(config)}
     there = ray.cluster_resources().get("GPU", 0.0) if here is None else here
     if sum(wanted.values()) <= there:
@@ -286,8 +276,6 @@ def _ray(
     address: str | None, host: str, port: int, tls: Tls | None, num_cpus: int | None, ingress: bool
 ) -> Iterator[dict[str, Any]]:
     """Connect to a Ray or start one; yield Serve's options for its host, port and certificate."""
-    import ray
-
     if not ray.is_initialized() and address is None:
         with own_ray(host, port, tls=tls, num_cpus=num_cpus, ingress=ingress) as listener:
             if listener is not None:
@@ -316,8 +304,6 @@ def _ray(
 
 def spread_over_gpus(parts: Mapping[str, ServeDeploySchema], *, kept: float = 0.0) -> dict[str, ServeDeploySchema]:
     """Return deployments that share the GPUs of the connected cluster equally, except for `kept` GPUs."""
-    import ray
-
     share = max(0.0, ray.cluster_resources().get("GPU", 0.0) - kept) / len(parts)
     return {name: with_replicas_on(part, share) for name, part in parts.items()}
 
@@ -431,15 +417,12 @@ def _unready_reason(serve: Any, app: str, url: str | None, ours: Collection[str]
 
     A replica reports the reason, since over HTTP only clients with a key get it.
     """
-    from ray.exceptions import RayError
-    from ray.serve.exceptions import RayServeException
-
     refusal = None if url is None else _http_reason(url)
     if app not in ours or (url is not None and refusal is None):
         return refusal
     try:
         said: str | None = serve.get_app_handle(app).refusal.remote().result(timeout_s=5)
-    except (RayError, RayServeException, TimeoutError) as error:
+    except (ray.exceptions.RayError, RayServeException, TimeoutError) as error:
         said = str(error) or type(error).__name__
     return said or refusal
 
