@@ -38,8 +38,7 @@ _SOCKETS = (  # the longest socket names in such a folder: Ray's, and HAProxy's,
 _LONGEST = 107 - len("/vlr-12345678/") - max(map(len, _SOCKETS))
 _REMOVALS = 100  # attempts, 0.05 s apart, as a process that is ending may still write to the folder
 _FILE = "server.json"  # written into the private folder of a server's Ray when the server is ready
-_DAEMON = b"raylet"
-_ADDRESS = b"--gcs-address="
+
 MODE, _TOKENS = "RAY_AUTH_MODE", ("RAY_AUTH_TOKEN", "RAY_AUTH_TOKEN_PATH")
 # If this variable is "0", Ray assumes a single-node cluster and uses the loopback address as the node's, so that all
 # ports are bound there. (Ray replaces an address given as `_node_ip_address`.)
@@ -340,12 +339,12 @@ def _found() -> Iterator[tuple[LocalServer, dict[str, str]]]:
     for process in Path("/proc").glob("[0-9]*"):
         try:
             words = (process / "cmdline").read_bytes().split(b"\0")
-            if Path(os.fsdecode(words[0])).name != os.fsdecode(_DAEMON) or process.stat().st_uid != os.getuid():
+            if Path(os.fsdecode(words[0])).name != "raylet" or process.stat().st_uid != os.getuid():
                 continue
             pairs = (one.partition(b"=") for one in (process / "environ").read_bytes().split(b"\0"))
             environment = {os.fsdecode(key): os.fsdecode(value) for key, _, value in pairs}
             content = json.loads((Path(environment[MARK]) / _FILE).read_text())
-            address = f"{_ADDRESS.decode()}{content['ray_address']}"
+            address = f"--gcs-address={content['ray_address']}"
         except (OSError, KeyError, ValueError, TypeError):  # it has ended, is another user's, or is not announced
             continue
         # A killed cluster may have left the folder, and another cluster may use it now.

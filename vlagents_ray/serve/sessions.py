@@ -6,7 +6,6 @@ move to another replica of the same policy, together with that copy.
 
 from __future__ import annotations
 
-import logging
 import threading
 import time
 from collections import Counter, OrderedDict
@@ -21,7 +20,6 @@ from vlagents_ray.serve.weights import WeightsVersion
 
 M = TypeVar("M")  # type of a loaded model
 
-logger = logging.getLogger(__name__)
 
 _REMEMBERED = 4096  # number of remembered sessions that left, whose older states are refused (some 500 bytes each)
 _ANY = 2**63  # number of moves that makes a version newer than any other state of its step

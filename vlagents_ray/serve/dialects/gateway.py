@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-import logging
 from functools import partial
 from typing import Any
 
@@ -20,8 +19,6 @@ from vlagents_ray.serve.config.deployment import ServerArgs
 from vlagents_ray.serve.dialects.base import Connect, GatewayContext, PortDialect
 from vlagents_ray.serve.engine.admission import Admission
 from vlagents_ray.serve.ports import LOOPBACK, reserve
-
-logger = logging.getLogger(__name__)
 
 _LOADING_S = 3600.0  # time limit for loading the policy; a failure is raised at once
 _ANSWER_S = 30.0
