@@ -263,7 +263,7 @@ def page_server(
     try:
         yield f"http://{f'[{host}]' if ':' in host else host}:{listening.getsockname()[1]}{LIVE_PAGE}"
     finally:
-        if fleet.watched:
+        if fleet.viewers:
             time.sleep(_LAST_S)
         server.should_exit = True
         thread.join(_LEAVE_S)  # it may be waiting for a lost Ray

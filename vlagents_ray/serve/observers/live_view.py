@@ -284,27 +284,22 @@ class Fleet:
         `more` returns further entries of the document; if nothing has changed, it returns the same object as before.
         """
         self._own, self._others, self._more = own, others, more
-        self._viewers: set[Viewer] = set()
+        self.viewers: set[Viewer] = set()
         self._gathering: asyncio.Task[None] | None = None
         self._read: dict[str, int] = {}  # number of the last snapshot, by replica; "" is this one
-
-    @property
-    def watched(self) -> bool:
-        """Whether there are viewers."""
-        return bool(self._viewers)
 
     def add(self) -> Viewer:
         """Add a viewer, and gather snapshots for it from now on."""
         viewer = Viewer()
-        self._viewers.add(viewer)
+        self.viewers.add(viewer)
         if self._gathering is None:
             self._gathering = asyncio.ensure_future(self._gather())
         return viewer
 
     def remove(self, viewer: Viewer) -> None:
         """Remove a viewer; without viewers nothing is gathered."""
-        self._viewers.discard(viewer)
-        if not self._viewers and self._gathering is not None:
+        self.viewers.discard(viewer)
+        if not self.viewers and self._gathering is not None:
             self._gathering.cancel()
             self._gathering = None
 
@@ -326,12 +321,12 @@ class Fleet:
             except Exception:
                 logger.exception("the live view was not read; tried again")
             else:
-                for viewer in self._viewers:
+                for viewer in self.viewers:
                     viewer.put(snapshots, more)
             await asyncio.sleep(max(1 / live.RATE / 2, 1 / live.RATE - (time.monotonic() - begun)))
 
     async def _snapshots(self) -> list[Snapshot]:
-        shown = frozenset[str]().union(*(viewer.shown for viewer in self._viewers))
+        shown = frozenset[str]().union(*(viewer.shown for viewer in self.viewers))
         readers: dict[str, SnapshotReader] = {} if self._others is None else dict(await self._others.views())
         if self._own is not None:
             readers[""] = partial(asyncio.to_thread, self._own.read)
