@@ -11,7 +11,6 @@ import time
 from collections import Counter, deque
 from collections.abc import Awaitable, Callable, Collection, Mapping
 from dataclasses import dataclass, field
-from functools import partial
 from typing import Any, Protocol
 
 import numpy as np
@@ -328,14 +327,14 @@ class Fleet:
     async def _snapshots(self) -> list[Snapshot]:
         shown = frozenset[str]().union(*(viewer.shown for viewer in self.viewers))
         readers: dict[str, SnapshotReader] = {} if self._others is None else dict(await self._others.views())
-        if self._own is not None:
-            readers[""] = partial(asyncio.to_thread, self._own.read)
+        if (own := self._own) is not None:
+            readers[""] = lambda since, shown: asyncio.to_thread(own.read, since, shown)
         results = await asyncio.gather(
             *(read(self._read.get(name, 0), shown) for name, read in readers.items()), return_exceptions=True
         )
         found = {name: one for name, one in zip(readers, results, strict=True) if isinstance(one, Snapshot)}
         self._read = {name: found[name].number if name in found else self._read.get(name, 0) for name in readers}
-        if self._own is not None and isinstance(error := results[-1], BaseException):
+        if own is not None and isinstance(error := results[-1], BaseException):
             raise error
         return list(found.values())
 

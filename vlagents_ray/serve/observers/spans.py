@@ -58,7 +58,8 @@ class RequestSpans(Observer):
 
     def on_answer(self, pending: PendingRequest, reply: Reply) -> None:
         """Export the span of the answered request."""
-        if (begun := pending.kept.pop(self, None)) is not None:
+        begun: tuple[str, int] | None = pending.kept.pop(self, None)
+        if begun is not None:
             about = pending.session_id, pending.request.op, pending.rank.name.lower()
             error = "" if reply.error is None else f"{reply.error.code}: {reply.error}"[:_TEXT]
             self._answered.append(_ServedRequest(*about, *begun, reply.timing, error, time.time_ns()))
