@@ -542,11 +542,11 @@ def test_a_third_waits_for_the_episodes_on_the_first(serving: Callable[..., Engi
 
 def test_replicas_with_different_settings_have_different_versions(serving: Callable[..., Engine]) -> None:
     here, there = serving(), serving()
-    assert here.version == there.version
+    assert here.models.version == there.models.version
     swapped(here, "b/2")
-    assert here.version != there.version
+    assert here.models.version != there.models.version
     swapped(there, "b/2")
-    assert here.version == there.version
+    assert here.models.version == there.models.version
 
 
 def test_a_swap_without_room_takes_that_of_a_choice(serving: Callable[..., Engine], library: Library) -> None:

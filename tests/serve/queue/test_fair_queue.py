@@ -148,7 +148,7 @@ def queue() -> Iterator[Callable[[int], BatchQueue]]:
 
     yield make
     for one in made:
-        one.release()
+        one.poller.close()
 
 
 def put(queue: BatchQueue, name: str, **fields: float) -> PendingRequest:
@@ -190,4 +190,4 @@ def test_the_time_spent_waiting_for_requests_counts_as_idle() -> None:
     before_s, began = quiet.load_s()[0], time.perf_counter()
     assert quiet.next() == ([], []), "its thread is told that nothing came for long"
     assert 0.05 <= quiet.load_s()[0] - before_s <= time.perf_counter() - began
-    quiet.release()
+    quiet.poller.close()
