@@ -234,7 +234,7 @@ ENVS: dict[str, Adapter] = {
 # the first enabled one receives it.
 DIALECTS: dict[str, str] = {
     "openpi": "vlagents_ray.serve.dialects.openpi:OpenPiDialect",
-    "roboarena": "vlagents_ray.serve.dialects.roboarena:RoboArenaDialect",
+    "roboarena": "vlagents_ray.serve.dialects.openpi:RoboArenaDialect",
     "openvla": "vlagents_ray.serve.dialects.openvla:OpenVLADialect",
     "vla_eval": "vlagents_ray.serve.dialects.vla_eval:VlaEvalDialect",
     "gr00t": "vlagents_ray.serve.dialects.gr00t:GR00TDialect",

@@ -27,8 +27,7 @@ from vlagents_ray.protocol.messages import Limits
 from vlagents_ray.registry import dialect_class
 from vlagents_ray.serve.access.api_keys import NoKey
 from vlagents_ray.serve.config.dialects import DialectArgs
-from vlagents_ray.serve.dialects.base import GatewayContext, ReplicaContext
-from vlagents_ray.serve.dialects.routes import dialect_routes
+from vlagents_ray.serve.dialects.base import GatewayContext, ReplicaContext, dialect_routes
 from vlagents_ray.serve.endpoints.access_middleware import AccessMiddleware
 from vlagents_ray.serve.endpoints.http import build_http_app
 from vlagents_ray.serve.endpoints.shm import ShmServer
@@ -169,7 +168,7 @@ class Server:
             self._start()
             engine = self.engines[number]
             routes = dialect_routes(DialectArgs(**self._dialects), ReplicaContext(engine, lambda: METADATA, LIMITS))
-            app = build_http_app(engine, lambda: METADATA, LIMITS, dialects=routes)
+            app = build_http_app(engine, lambda: METADATA, LIMITS, more=routes)
             self._ports[number] = self._stack.enter_context(served(AccessMiddleware(app, None, "app")))
         return self._ports[number]
 

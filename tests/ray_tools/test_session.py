@@ -55,7 +55,7 @@ def test_a_cluster_that_was_lost_is_not_taken_for_the_one_that_this_process_join
     monkeypatch: pytest.MonkeyPatch, here: str | None, own: bool
 ) -> None:
     monkeypatch.setattr(joining, "_started", [SimpleNamespace(gcs_address="127.0.0.1:1")])
-    monkeypatch.setattr(joining, "node_of_this_process", lambda: here and SimpleNamespace(gcs_address=here))
+    monkeypatch.setattr(joining.private, "node_of_this_process", lambda: here and SimpleNamespace(gcs_address=here))
     assert joining.started_here() is own
 
 

@@ -17,12 +17,12 @@ from ray.serve.exceptions import RayServeException
 
 from vlagents_ray.errors import MissingDependency, PolicyFailed
 from vlagents_ray.serve.access.key_store import new_key
+from vlagents_ray.serve.app import application
 from vlagents_ray.serve.config.deployment import ServerArgs
 from vlagents_ray.serve.launch.deployment_file import IMPORT_PATH
 from vlagents_ray.serve.observers.live_view import ReplicaView
 from vlagents_ray.serve.ports import HOST
 from vlagents_ray.serve.replica import replica as module
-from vlagents_ray.serve.replica.app import build
 from vlagents_ray.serve.replica.replica import PolicyReplica
 from vlagents_ray.serve.scaling.rebalancer import Rebalancer
 from vlagents_ray.serve.scaling.session_migration import HeldSessions
@@ -110,7 +110,7 @@ def test_serve_status_shows_one_sentence_if_an_application_cannot_be_built(args:
 @pytest.mark.parametrize("act_s", [3.0, 60.0, 600.0])
 def test_serve_leaves_a_replica_that_does_not_answer_as_much_time_as_a_call_may_take(act_s: float) -> None:
     """Its policy may hold the interpreter's lock: Serve's checks are all that limits that."""
-    policy = build(ServerArgs(policy="noop", limits={"act_s": act_s}))._bound_deployment
+    policy = application(ServerArgs(policy="noop", limits={"act_s": act_s}))._bound_deployment
     assert policy._deployment_config.max_constructor_retry_count == 1, "it gives up after the first failed start"
     silent_s = 3 * policy._deployment_config.health_check_timeout_s
     assert act_s <= silent_s <= max(15.0, act_s)

@@ -53,8 +53,7 @@ from vlagents_ray.registry import dialect_class
 from vlagents_ray.serve import periodic
 from vlagents_ray.serve.access import api_keys
 from vlagents_ray.serve.config.dialects import DialectArgs
-from vlagents_ray.serve.dialects.base import GatewayContext, ReplicaContext
-from vlagents_ray.serve.dialects.routes import dialect_routes
+from vlagents_ray.serve.dialects.base import GatewayContext, ReplicaContext, dialect_routes
 from vlagents_ray.serve.endpoints import access_middleware, websocket
 from vlagents_ray.serve.endpoints.access_middleware import AccessMiddleware
 from vlagents_ray.serve.endpoints.http import build_http_app
@@ -169,10 +168,10 @@ class KeyedReplica:
         self.engine.start()
         routes = dialect_routes(DialectArgs(**ALL), ReplicaContext(self.engine, lambda: METADATA, LIMITS))
         metadata = METADATA | {"policy_version": None, "weights": None}
-        view = ReplicaView(self.engine, self.engine.observers, "this", "here", lambda: metadata)
+        view = ReplicaView(self.engine, "this", "here", lambda: metadata)
         live = live_routes(Fleet(view), open_to_network=False)
         others = [*weights_routes(_Receiving(self), 30.0, open_to_network=False), *live]
-        inside = build_http_app(self.engine, lambda: METADATA, LIMITS, dialects=routes, others=others)
+        inside = build_http_app(self.engine, lambda: METADATA, LIMITS, more=[*routes, *others])
         self.routes = inside.routes
         self.port = stack.enter_context(served(AccessMiddleware(inside, self.known.keys, "app")))
         check = partial(self.at_gateway.check, app="app")

@@ -15,8 +15,7 @@ from vlagents_ray.protocol.messages import Limits
 from vlagents_ray.registry import DIALECTS, dialect_class
 from vlagents_ray.serve.access.api_keys import Keys
 from vlagents_ray.serve.config.dialects import DialectArgs
-from vlagents_ray.serve.dialects.base import ReplicaContext, RouteDialect
-from vlagents_ray.serve.dialects.routes import dialect_routes
+from vlagents_ray.serve.dialects.base import ReplicaContext, RouteDialect, dialect_routes
 from vlagents_ray.serve.endpoints.access_middleware import AccessMiddleware
 from vlagents_ray.serve.endpoints.http import build_http_app
 from vlagents_ray.serve.engine.engine import Engine
@@ -48,7 +47,7 @@ def serving(
 def client_of(engine: Engine, dialects: dict[str, Any], keys: Keys | None = None) -> TestClient:
     """A client of the dialects over an engine."""
     routes = dialect_routes(DialectArgs(**dialects), ReplicaContext(engine, lambda: METADATA, LIMITS))
-    inside = build_http_app(engine, lambda: METADATA, LIMITS, dialects=routes)
+    inside = build_http_app(engine, lambda: METADATA, LIMITS, more=routes)
     return TestClient(AccessMiddleware(inside, keys, "app"))
 
 

@@ -38,8 +38,7 @@ from vlagents_ray.protocol.frames import CONTENT_TYPE
 from vlagents_ray.protocol.messages import Limits, LocalAddress, Request
 from vlagents_ray.serve.access.api_keys import Keys
 from vlagents_ray.serve.config.dialects import DialectArgs
-from vlagents_ray.serve.dialects.base import ReplicaContext
-from vlagents_ray.serve.dialects.routes import dialect_routes
+from vlagents_ray.serve.dialects.base import ReplicaContext, dialect_routes
 from vlagents_ray.serve.endpoints.access_middleware import AccessMiddleware
 from vlagents_ray.serve.endpoints.http import build_http_app
 from vlagents_ray.serve.endpoints.shm import ShmServer
@@ -78,9 +77,7 @@ def serve() -> None:
     own.open(), near.open()
     engine.start()
     routes = dialect_routes(DialectArgs(**ALL), ReplicaContext(engine, lambda: METADATA, limits))
-    with served(
-        AccessMiddleware(build_http_app(engine, lambda: METADATA, limits, dialects=routes), keys, "app")
-    ) as port:
+    with served(AccessMiddleware(build_http_app(engine, lambda: METADATA, limits, more=routes), keys, "app")) as port:
         found = {"port": port, "own": [own.address.port, own.path], "local": asdict(near.address)}
         print(json.dumps(found), flush=True)
         sys.stdin.read()

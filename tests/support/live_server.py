@@ -111,7 +111,7 @@ def live_server(
     view = observers.view
     fleet = Fleet(view, others)
     routes = live_routes(fleet, open_to_network=insecure)
-    inside = build_http_app(engine, lambda: METADATA, DEFAULT_LIMITS, others=routes)
+    inside = build_http_app(engine, lambda: METADATA, DEFAULT_LIMITS, more=routes)
     with ExitStack() as stack:
         stack.callback(observers.close)
         stack.callback(engine.close)

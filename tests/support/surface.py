@@ -163,7 +163,7 @@ def paths() -> Iterator[str]:
     weights = importlib.import_module("vlagents_ray.serve.endpoints.weights")
     watched = live.live_routes(None, open_to_network=False)
     pushed = weights.weights_routes(None, 0.0, open_to_network=False)
-    app = http.build_http_app(None, dict, None, others=[*watched, *pushed])
+    app = http.build_http_app(None, dict, None, more=[*watched, *pushed])
     for route in app.routes:
         methods = " ".join(sorted((getattr(route, "methods", None) or {"WS"}) - {"HEAD"}))
         yield f"{methods} {route.path}"

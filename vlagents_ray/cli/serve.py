@@ -118,7 +118,6 @@ def connection_lines(
 ) -> Iterator[str]:
     """Return lines with the URL, policy and page of each application, and addresses for clients of other systems."""
     from vlagents_ray.serve.config.deployment import ServerArgs
-    from vlagents_ray.serve.dialects.routes import describe
     from vlagents_ray.serve.launch.deployment_file import IMPORT_PATH, own_settings
 
     for app in config.applications:
@@ -136,7 +135,7 @@ def connection_lines(
         yield f"  how to talk to it: {curl}{url}/docs"
         if not (insecure or args.access.insecure):  # --insecure shows no live page
             yield f"  what it does now: {url}/live"
-        for name, one in describe(args.dialects).items():
+        for name, one in args.dialects.describe().items():
             places = [one["address"]] if "address" in one else [_address(url, path) for path in one["paths"]]
             yield f"  {name}: {', '.join(places)}"
 

@@ -119,8 +119,7 @@ def decode_requests(data: Buffer, budget: Budget, ops: Sequence[Op] = OPS) -> De
 
 
 def _read_request(node: dict[str, Any], reader: ValueReader, limits: Limits, ops: Sequence[Op] = OPS) -> Request:
-    unknown = node.keys() - _REQUEST_KEYS
-    if unknown:
+    if unknown := node.keys() - _REQUEST_KEYS:
         raise MalformedMessage(f"request: unknown keys {shown(sorted(unknown))}, want some of {sorted(_REQUEST_KEYS)}")
     if node.get("op") not in ops:
         raise MalformedMessage(f"op: got {shown(node.get('op'))}, want one of {list(ops)}")
@@ -148,8 +147,7 @@ def _read_request(node: dict[str, Any], reader: ValueReader, limits: Limits, ops
 
 def _step(node: dict[str, Any]) -> Any:
     """Return the `step` of a request or reply. It is sent as text: some JSON parsers round numbers above 2**53."""
-    step = node.get("step")
-    if step is None:
+    if (step := node.get("step")) is None:
         return None
     if not (isinstance(step, str) and step.isascii() and step.isdecimal() and len(step) < 20):
         raise MalformedMessage(f"step: got {shown(step)}, want the text of the last answer, such as '7'")

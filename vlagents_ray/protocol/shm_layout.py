@@ -50,14 +50,7 @@ class Layout:
 
     @classmethod
     def of(cls, session: str, rank: RankName, cameras: Sequence[Any], state: Sequence[Any]) -> Layout:
-        """Compute the layout of arrays with these shapes.
-
-        Args:
-            session: The session's id.
-            rank: The class of its requests.
-            cameras: Pairs of name and shape, (H, W, 3).
-            state: Pairs of name and shape, (D,).
-        """
+        """Compute the layout of arrays, given as pairs of name and shape: (H, W, 3) for cameras, (D,) for states."""
         at = 0
         placed: tuple[list[Any], list[Any]] = ([], [])
         for group, arrays, width in zip(placed, (cameras, state), (1, 4), strict=True):

@@ -68,8 +68,7 @@ class ValueReader:
     """Converts JSON back to values, which are views of the blobs where possible."""
 
     def __init__(self, blobs: Sequence[Buffer], budget: Budget) -> None:
-        self._blobs = blobs
-        self._budget = budget
+        self._blobs, self._budget = blobs, budget
         self._limits = budget.limits
         self._items = 0
         self._images: dict[int, np.ndarray] = {}  # by blob: each image is decoded once, whatever its number of uses
@@ -110,8 +109,7 @@ class ValueReader:
 
     def blob(self, node: Any) -> Any:
         """Return the array, image, bytes or number that `{"$": [...]}` refers to."""
-        reference = _reference(node)
-        if not reference or len(node) != 1:
+        if not (reference := _reference(node)) or len(node) != 1:
             raise MalformedMessage(f"reference: got {shown(node)}, want {{'$': [kind, blob, ...]}}")
         kind, *rest = reference
         if kind == "nd" and len(rest) == 3:
@@ -128,8 +126,7 @@ class ValueReader:
 
     def _image(self, index: Any) -> np.ndarray:
         data = self._get(index)
-        image = self._images.get(index)
-        if image is None:
+        if (image := self._images.get(index)) is None:
             [image] = decode_files([data], self._budget)
             self._images[index] = image
         elif index in self._fresh:  # the budget was charged when the image was decoded
@@ -141,8 +138,7 @@ class ValueReader:
 
     def _bytes_of(self, index: Any) -> bytes:
         data = self._get(index)
-        known = self._copies.get(index)
-        if known is None:
+        if (known := self._copies.get(index)) is None:
             self._budget.hold(len(data))
             known = self._copies[index] = bytes(data)
         else:
@@ -169,8 +165,7 @@ def read_obs(node: Any, reader: ValueReader, limits: Limits) -> Obs:
     """Read an observation from its JSON form, in which cameras and state parts may be references or lists."""
     if not isinstance(node, dict):
         raise MalformedMessage(f"obs: got {type(node).__name__}, want an object")
-    unknown = node.keys() - _OBS_KEYS
-    if unknown:
+    if unknown := node.keys() - _OBS_KEYS:
         raise MalformedMessage(f"obs: unknown keys {shown(sorted(unknown))}, want some of {sorted(_OBS_KEYS)}")
     cameras, state = node.get("cameras") or {}, node.get("state") or {}
     info, gripper = node.get("info") or {}, node.get("gripper")

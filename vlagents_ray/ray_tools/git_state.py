@@ -66,8 +66,7 @@ def _code(top: str) -> GitState | None:
 
 def _git(folder: Path, *words: str) -> bytes | None:
     """Return the output of git; None if it fails."""
-    git = shutil.which("git")
-    if git is None:
+    if (git := shutil.which("git")) is None:
         return None
     quiet = os.environ | {"GIT_OPTIONAL_LOCKS": "0"}
     try:

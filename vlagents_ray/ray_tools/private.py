@@ -118,8 +118,7 @@ def gpus_here() -> float:
     """Count the GPUs that Ray would offer on this machine, without starting Ray and without torch."""
     from ray._private.accelerators import get_accelerator_manager_for_resource
 
-    manager = get_accelerator_manager_for_resource("GPU")
-    if manager is None:
+    if (manager := get_accelerator_manager_for_resource("GPU")) is None:
         return 0.0
     visible = manager.get_current_process_visible_accelerator_ids()  # from CUDA_VISIBLE_DEVICES and similar variables
     found = manager.get_current_node_num_accelerators()
@@ -129,18 +128,20 @@ def gpus_here() -> float:
 # Channels: mutable objects in plasma, on which Ray's `Channel` is built.
 
 
-def plasma_folder() -> Path:
-    """Return the folder of the socket of this node's object store."""
+def _worker() -> Any:
     import ray
 
-    return Path(ray._private.worker.global_worker.node.plasma_store_socket_name).parent
+    return ray._private.worker.global_worker
+
+
+def plasma_folder() -> Path:
+    """Return the folder of the socket of this node's object store."""
+    return Path(_worker().node.plasma_store_socket_name).parent
 
 
 def create_channel(size: int) -> Any:
     """Create a channel of `size` bytes that this process reads, and return its ref."""
-    import ray
-
-    worker = ray._private.worker.global_worker
+    worker = _worker()
     ref = worker.put_object(bytes(size), _is_experimental_channel=True)
     worker.core_worker.experimental_channel_register_reader(ref)
     return ref
@@ -148,9 +149,7 @@ def create_channel(size: int) -> Any:
 
 def register_writer(channel: Any) -> None:
     """Register this process as the writer of a channel, which Ray's `Channel` does only together with pickling."""
-    import ray
-
-    ray._private.worker.global_worker.core_worker.experimental_channel_register_writer(channel, {})
+    _worker().core_worker.experimental_channel_register_writer(channel, {})
 
 
 def write_channel(channel: Any, content: Any, wait_ms: int) -> str | None:
@@ -160,9 +159,8 @@ def write_channel(channel: Any, content: Any, wait_ms: int) -> str | None:
     """
     import ray
 
-    core = ray._private.worker.global_worker.core_worker
     try:
-        core.experimental_channel_put_serialized(content, channel, 1, wait_ms)
+        _worker().core_worker.experimental_channel_put_serialized(content, channel, 1, wait_ms)
     except ray.exceptions.RayChannelError as error:
         return str(error)
     return None
@@ -174,9 +172,7 @@ def read_channel(channel: Any) -> Any:
     Raises:
         ray.exceptions.RayChannelTimeoutError: Nothing was written since the last call.
     """
-    import ray
-
-    return ray._private.worker.global_worker.core_worker.get_objects([channel], 0)[0]
+    return _worker().core_worker.get_objects([channel], 0)[0]
 
 
 def channel_content(tag: bytes, pieces: Iterable[memoryview]) -> Any:
@@ -247,8 +243,7 @@ def long_polls(client: Any) -> Iterator[Any]:
     from ray.serve._private.router import SharedRouterLongPollClient
 
     for handle in client.handle_cache.values():
-        router = getattr(handle._router, "_asyncio_router", None)
-        if router is not None:
+        if (router := getattr(handle._router, "_asyncio_router", None)) is not None:
             yield router.long_poll_client
             yield SharedRouterLongPollClient.get_or_create(client._controller, router._event_loop).long_poll_client
 
@@ -275,9 +270,7 @@ def http_options() -> Any:
 
 def replica_is_ending() -> bool:
     """Return whether Serve has begun to stop the replica in this process; Serve has no public hook for that."""
-    import ray
-
-    worker = ray._private.worker.global_worker
+    worker = _worker()
     actor = worker.actors.get(worker.actor_id)
     return bool(actor._replica_impl._shutting_down)
 

@@ -18,13 +18,7 @@ from typing import Any
 from urllib.parse import urlsplit
 
 from vlagents_ray.errors import ClusterLost, ConfigError
-from vlagents_ray.ray_tools.private import (
-    START_LOGGER,
-    address_of_ray_start,
-    node_of_this_process,
-    node_that_failed,
-    start_head,
-)
+from vlagents_ray.ray_tools import private
 from vlagents_ray.ray_tools.reaper import MARK, reaped
 from vlagents_ray.ray_tools.signals import own_sigterm
 
@@ -44,8 +38,7 @@ _SOCKETS = (  # the longest socket names in such a folder: Ray's, and HAProxy's,
 _LONGEST = 107 - len("/vlr-12345678/") - max(map(len, _SOCKETS))
 _REMOVALS = 100  # attempts, 0.05 s apart, as a process that is ending may still write to the folder
 _FILE = "server.json"  # written into the private folder of a server's Ray when the server is ready
-_DAEMON = b"raylet"
-_ADDRESS = b"--gcs-address="
+
 MODE, _TOKENS = "RAY_AUTH_MODE", ("RAY_AUTH_TOKEN", "RAY_AUTH_TOKEN_PATH")
 # If this variable is "0", Ray assumes a single-node cluster and uses the loopback address as the node's, so that all
 # ports are bound there. (Ray replaces an address given as `_node_ip_address`.)
@@ -101,7 +94,7 @@ def _local_server(address: str | None) -> str | None:
     if address != "auto":
         return None
     # If there is no cluster of `ray start`, Ray would try that of a server on this machine, and wait for ten minutes.
-    return "" if address_of_ray_start() is None and local_servers() else None
+    return "" if private.address_of_ray_start() is None and local_servers() else None
 
 
 @contextlib.contextmanager
@@ -166,10 +159,10 @@ def start_ray(folder: Path, **options: Any) -> None:
         node = None
         try:
             with own_sigterm(), _taken_port() as port:
-                node = start_head(str(folder / FILES), port, _system_config=_CONFIG, **resources)
+                node = private.start_head(str(folder / FILES), port, _system_config=_CONFIG, **resources)
                 ray.init(node.gcs_address, **({"log_to_driver": False} | options))
         except Exception as error:  # Ray raises a plain Exception
-            node = node or node_that_failed(error)
+            node = node or private.node_that_failed(error)
             if node is None or not node.all_processes:  # nothing was started, so time is not the cause
                 raise
             node.kill_all_processes(check_alive=False, wait=True)  # Ray does not end them itself
@@ -199,7 +192,7 @@ def leave_ray() -> None:
 
 def started_here() -> bool:
     """Return whether this process is in a cluster that it started itself."""
-    node = node_of_this_process()
+    node = private.node_of_this_process()
     return node is not None and any(one.gcs_address == node.gcs_address for one in _started)
 
 
@@ -216,7 +209,7 @@ def _taken_port() -> Iterator[int]:
         def is_shown(record: logging.LogRecord) -> bool:
             return f":{port} " not in record.getMessage()
 
-        logger = logging.getLogger(START_LOGGER)
+        logger = logging.getLogger(private.START_LOGGER)
         logger.addFilter(is_shown)
         try:
             with warnings.catch_warnings():
@@ -286,8 +279,6 @@ def join(server: str | None = None, **options: Any) -> LocalServer:
     """
     import ray
 
-    from vlagents_ray.ray_tools.private import reread_authentication_mode, use_loopback
-
     chosen, environment = _chosen(server)
     if ray.is_initialized():
         if ray.get_runtime_context().gcs_address == chosen.ray_address:
@@ -304,8 +295,8 @@ def join(server: str | None = None, **options: Any) -> LocalServer:
     for one in _TOKENS:
         os.environ.pop(one, None)
     os.environ.update({MODE: "token", ALONE: "0"} | tokens)
-    use_loopback(True)  # Ray has already read the variables, when it was imported
-    reread_authentication_mode()
+    private.use_loopback(True)  # Ray has already read the variables, when it was imported
+    private.reread_authentication_mode()
     ray.init(chosen.ray_address, **{"log_to_driver": True, "logging_level": "WARNING"} | options)
     return chosen
 
@@ -313,10 +304,7 @@ def join(server: str | None = None, **options: Any) -> LocalServer:
 def announce(url: str, apps: Mapping[str, str], ray_address: str) -> None:
     """Announce the server of this process's Ray, which is ready, in a file that other programs of this user can find.
 
-    Args:
-        url: The server's URL.
-        apps: Its applications by name.
-        ray_address: The address of its Ray cluster, host:port.
+    `apps` are its applications by name, and `ray_address` is host:port of its Ray cluster.
     """
     new = Path(os.environ[MARK]) / f"{_FILE}.new"
     new.write_text(json.dumps(asdict(LocalServer(url, tuple(apps), ray_address))))
@@ -351,12 +339,12 @@ def _found() -> Iterator[tuple[LocalServer, dict[str, str]]]:
     for process in Path("/proc").glob("[0-9]*"):
         try:
             words = (process / "cmdline").read_bytes().split(b"\0")
-            if Path(os.fsdecode(words[0])).name != os.fsdecode(_DAEMON) or process.stat().st_uid != os.getuid():
+            if Path(os.fsdecode(words[0])).name != "raylet" or process.stat().st_uid != os.getuid():
                 continue
             pairs = (one.partition(b"=") for one in (process / "environ").read_bytes().split(b"\0"))
             environment = {os.fsdecode(key): os.fsdecode(value) for key, _, value in pairs}
             content = json.loads((Path(environment[MARK]) / _FILE).read_text())
-            address = f"{_ADDRESS.decode()}{content['ray_address']}"
+            address = f"--gcs-address={content['ray_address']}"
         except (OSError, KeyError, ValueError, TypeError):  # it has ended, is another user's, or is not announced
             continue
         # A killed cluster may have left the folder, and another cluster may use it now.

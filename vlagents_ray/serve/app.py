@@ -1,20 +1,34 @@
-"""The import path of deployment files: `import_path: vlagents_ray.serve.app:build`."""
+"""The Serve application of one policy: its deployments, and Serve's options for them.
+
+Deployment files name it, as `import_path: vlagents_ray.serve.app:build`.
+"""
 
 from __future__ import annotations
 
+import os
+import warnings
 from collections.abc import Mapping
 from typing import Any
 
 from pydantic import ValidationError
+from ray import serve
 from ray.serve import Application
+from ray.serve.config import RequestRouterConfig
 from ray.serve.exceptions import RayServeException
 
 from vlagents_ray.errors import VLAgentsError
-from vlagents_ray.serve.config.deployment import ServerArgs
-from vlagents_ray.serve.replica import app
+from vlagents_ray.serve.config.deployment import GATEWAY, POLICY, ServerArgs
+from vlagents_ray.serve.dialects.gateway import Gateway
+from vlagents_ray.serve.python_env.probe import with_process
+from vlagents_ray.serve.replica.replica import PolicyReplica
 from vlagents_ray.settings import wrong_settings
 
-__all__ = ["build"]
+_FAILURES = 3  # number of consecutive failed health checks after which Serve replaces a replica
+_LEAST_ANSWER_S = 5.0  # minimum time limit of a health check, for a busy machine
+_HEAD = "node:__internal_head__"  # a resource that Ray assigns to the head node of any cluster
+# A replica gets neither these settings nor the dialects of the gateway, and is not restarted when they change.
+_OUTSIDE: Any = {"replicas": True, "autoscaling": True, "resources": True}
+_AT_ONCE: Any = {"graceful_shutdown_wait_loop_s": 0.1}  # period at which remaining requests are counted; Serve's: 2 s
 
 
 def build(args: Mapping[str, Any] | ServerArgs) -> Application:
@@ -25,8 +39,73 @@ def build(args: Mapping[str, Any] | ServerArgs) -> Application:
             text of this exception, but a traceback of forty lines for any other.
     """
     try:
-        return app.build(ServerArgs.model_validate(args))
+        return application(ServerArgs.model_validate(args))
     except ValidationError as error:
         raise RayServeException(wrong_settings(error, ServerArgs)) from None
     except VLAgentsError as error:
         raise RayServeException(f"{type(error).__name__}: {error}") from None
+
+
+def application(args: ServerArgs, *, drains: bool = True) -> Application:
+    """Build the Serve application of one policy.
+
+    Args:
+        drains: Whether stopping replicas wait for requests over HTTP.
+
+    Raises:
+        ConfigError: The policy cannot run in its environment.
+    """
+    args = args.model_copy(update={"environment": with_process(args.environment)})
+    options: dict[str, Any] = {
+        "name": POLICY,
+        "health_check_period_s": 1 if args.environment.process == "child" else 5,  # three failures replace it
+        # A replica that does not reply is frozen, or its policy holds the interpreter's lock: then only these checks
+        # limit the time of a call. Together they take the limit of a call; Serve's default is 95 s for any policy.
+        "health_check_timeout_s": max(_LEAST_ANSWER_S, args.limits.act_s / _FAILURES),
+        # A policy that failed to load once will fail again. While other replicas run, Serve retries forever.
+        "max_constructor_retry_count": 1,
+        "user_config": {},  # settings of the policy that a file states beside `args`; they change without a restart
+        "ray_actor_options": {
+            "num_cpus": args.resources.num_cpus,
+            "num_gpus": args.resources.num_gpus,
+            "resources": args.resources.custom,
+            **({} if args.resources.memory is None else {"memory": args.resources.memory}),
+            # Without this setting, Serve applies the application's.
+            **({"runtime_env": environment} if (environment := args.environment.runtime_env()) else {}),
+        },
+        # A WebSocket session counts as a request as long as it lasts, so the limit must allow all sessions and two
+        # batches. It is no protection against overload, since requests wait in the batch queue.
+        "max_ongoing_requests": args.sessions.limit + 2 * args.batch.max_size,
+        "graceful_shutdown_timeout_s": 20,
+        **({} if drains else _AT_ONCE),
+    }
+    if args.autoscaling is not None:
+        options["autoscaling_config"] = args.autoscaling.options()
+    else:
+        options["num_replicas"] = args.replicas or 1
+    if os.environ.get("RAY_SERVE_ENABLE_HA_PROXY") != "1":
+        # HAProxy itself hashes the session header (see haproxy.py) and refuses a custom router.
+        options["request_router_config"] = RequestRouterConfig(
+            request_router_class="vlagents_ray.serve.scaling.router.SessionRouter"
+        )
+    replica = serve.ingress()(PolicyReplica)
+    with warnings.catch_warnings():  # `metrics_interval_s` is deprecated for a variable that affects a whole cluster
+        warnings.simplefilter("ignore", DeprecationWarning)
+        policy = serve.deployment(**options)(replica)
+    gateways = args.dialects.gateways()
+    settings = args.model_dump(mode="json", exclude=_OUTSIDE | {"dialects": set(gateways)})
+    return policy.bind(settings, _gateway(args) if gateways else None)
+
+
+def _gateway(args: ServerArgs) -> Application:
+    """Build the process of the dialects that have their own port; it runs on the head node, where clients connect."""
+    options: dict[str, Any] = {
+        "name": GATEWAY,
+        "num_replicas": 1,
+        "graceful_shutdown_timeout_s": 10,
+        **_AT_ONCE,  # no request of Serve delays its end: clients use its own ports
+        "health_check_period_s": 5,
+        "ray_actor_options": {"num_cpus": 0, "resources": {_HEAD: 0.001}},
+    }
+    settings = args.model_dump(mode="json", include={"policy", "dialects", "limits", "sessions", "access"})
+    return serve.deployment(**options)(Gateway).bind(settings)

@@ -7,7 +7,6 @@ import random
 import socket
 import time
 from collections import deque
-from typing import Any
 
 from vlagents_ray.errors import ConfigError
 
@@ -60,11 +59,6 @@ def keep(*ports: int) -> None:
     _kept.update(ports)
 
 
-def free_ports(number: int) -> list[int]:
-    """Return distinct ports that are free on all addresses, as HAProxy's metrics and statistics listen on all."""
-    return sorted(free_port(EVERYWHERE) for _ in range(number))
-
-
 def free_block(size: int) -> int:
     """Return the first of `size` consecutive ports for the replicas; it is free, and Ray skips any others in use."""
     for _ in range(100):
@@ -91,7 +85,12 @@ def reserve(name: str, host: str, port: int, timeout_s: float = _RELEASE_S) -> s
     Raises:
         ConfigError: Another process still uses the port after `timeout_s`, or this machine has no such address.
     """
-    family, _, _, _, address = _resolve(name, host, port)
+    try:
+        found = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE)
+    except OSError as error:
+        cure = f"change dialects.{name}.host"
+        raise ConfigError(f"{name}: {host!r} is no address of this machine ({error}); {cure}") from error
+    family, _, _, _, address = found[0]
     deadline = time.monotonic() + timeout_s
     while True:
         listener = socket.socket(family, socket.SOCK_STREAM)
@@ -108,12 +107,3 @@ def reserve(name: str, host: str, port: int, timeout_s: float = _RELEASE_S) -> s
                 f"in dialects.{name}"
             ) from error
         return listener
-
-
-def _resolve(name: str, host: str, port: int) -> Any:
-    try:
-        return socket.getaddrinfo(host, port, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE)[0]
-    except OSError as error:
-        raise ConfigError(
-            f"{name}: {host!r} is no address of this machine ({error}); change dialects.{name}.host"
-        ) from error

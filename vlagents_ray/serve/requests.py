@@ -40,6 +40,7 @@ Answered = Callable[["Message"], None]
 
 logger = logging.getLogger(__name__)
 
+_TIMES = ("total_ms", "decode_ms", "queue_ms", "inference_ms", "encode_ms")  # after the total as in `STAGES`
 _NOT_MEASURED = (0.0,) * 4  # stages of a request that failed
 
 
@@ -140,7 +141,7 @@ class PendingRequest:
         """Cancel the preparation of the observation, unless it has begun."""
         preparation, self.preparation = self.preparation, None
         if preparation is not None:
-            preparation.cancel()
+            preparation.future.cancel()
 
     def fail(self, error: VLAgentsError) -> None:
         """Deliver an error, unless the request is over."""
@@ -278,16 +279,12 @@ class Message:
             self._asked = self._asked[:1]
         for (op, rank), reply in zip(self._asked, self.replies, strict=True):
             if reply.error is None:
-                timing = reply.timing
-                decode_ms, queue_ms = timing.get("decode_ms", 0.0), timing.get("queue_ms", 0.0)
-                inference_ms, encode_ms = timing.get("inference_ms", 0.0), timing.get("encode_ms", 0.0)
-                total_ms = timing.get("total_ms", 0.0)  # replies too large together are sent as errors, without times
-                times = (total_ms, decode_ms, queue_ms, inference_ms, encode_ms)  # in the order of `STAGES`
+                # Replies too large together are sent as errors, without times.
+                times = tuple([reply.timing.get(name, 0.0) for name in _TIMES])
                 self._stats.handled((op, self.transport, rank, "ok"), times)
             else:
                 total_ms = (time.perf_counter() - self.arrived) * 1e3
-                code = reply.error.code
-                self._stats.handled((op, self.transport, rank, code), (total_ms, *_NOT_MEASURED))
+                self._stats.handled((op, self.transport, rank, reply.error.code), (total_ms, *_NOT_MEASURED))
 
 
 def _json(value: dict[str, Any]) -> str:

@@ -6,7 +6,6 @@ move to another replica of the same policy, together with that copy.
 
 from __future__ import annotations
 
-import logging
 import threading
 import time
 from collections import Counter, OrderedDict
@@ -21,7 +20,6 @@ from vlagents_ray.serve.weights import WeightsVersion
 
 M = TypeVar("M")  # type of a loaded model
 
-logger = logging.getLogger(__name__)
 
 _REMEMBERED = 4096  # number of remembered sessions that left, whose older states are refused (some 500 bytes each)
 _ANY = 2**63  # number of moves that makes a version newer than any other state of its step
@@ -88,30 +86,23 @@ class SessionTable(Generic[M]):
     is always above those that the session's client and this replica have seen, even if the clocks are wrong.
     """
 
-    def __init__(
-        self,
-        limit: int,
-        idle_s: float,
-        clock: Callable[[], int] = time.time_ns,
-        ended: Callable[[Session[M]], None] = lambda _: None,
-    ) -> None:
+    def __init__(self, limit: int, idle_s: float, clock: Callable[[], int] = time.time_ns) -> None:
         """Create an empty table.
 
         Args:
             limit: Largest number of sessions.
             idle_s: Time without a request after which a session may be dropped, s.
             clock: Wall clock, ns.
-            ended: Called with each session that is removed, under the table's lock.
         """
-        self._ended = ended
+        # Called with each session that is removed, under the table's lock.
+        self.ended: Callable[[Session[M]], None] = lambda _: None
         self._sessions: dict[str, Session[M]] = {}
         self.limit = limit
         self.opened = 0  # number of sessions opened so far
-        self._idle_s = idle_s
-        self._clock = clock
+        self._idle_s, self._clock = idle_s, clock
         self._drawn = 0  # latest step drawn
         self._left: OrderedDict[str, Version] = OrderedDict()  # by session: version up to which its states are refused
-        self._lock = threading.Lock()
+        self._lock = threading.RLock()
 
     def __len__(self) -> int:
         return len(self._sessions)
@@ -121,8 +112,7 @@ class SessionTable(Generic[M]):
 
     def get(self, session_id: str) -> Session[M]:
         """Return the session, and mark it used; raise `UnknownSession` if it is not here."""
-        session = self._sessions.get(session_id)
-        if session is None:
+        if (session := self._sessions.get(session_id)) is None:
             raise UnknownSession(
                 f"session {session_id!r}: unknown here; it was never reset, idled for {self._idle_s:g} s, "
                 f"or its replica was replaced: send a reset first"
@@ -138,12 +128,11 @@ class SessionTable(Generic[M]):
             TooManyRequests: The key of the origin's caller has reached its limit of sessions.
         """
         with self._lock:
-            session = self._sessions.get(session_id)
-            if session is None:
+            if (session := self._sessions.get(session_id)) is None:
                 if origin.caller is not None and (most := origin.caller.sessions) is not None:
                     self._require_below(origin.prefix, most)
                 if len(self._sessions) >= self.limit:
-                    self._drop_idle()
+                    self.drop_idle()
                 if len(self._sessions) >= self.limit:
                     raise self.full()
                 session = self._sessions[session_id] = Session(session_id)
@@ -171,7 +160,7 @@ class SessionTable(Generic[M]):
             session.expected = session.first
             if session.steps == 0:  # the reset was the session's first one here
                 del self._sessions[session_id]
-                self._ended(session)
+                self.ended(session)
 
     def is_past(self, session_id: str, first: int) -> bool:
         """Return whether the session has passed an episode that was to begin at that step, here or elsewhere."""
@@ -206,7 +195,7 @@ class SessionTable(Generic[M]):
             if here is None:
                 self.opened += 1
             else:
-                self._ended(here)
+                self.ended(here)
             self._sessions[arriving.id] = arriving
 
     def held(self, session_ids: Iterable[str]) -> dict[str, Version]:
@@ -231,7 +220,7 @@ class SessionTable(Generic[M]):
 
     def _require_below(self, prefix: str, limit: int) -> None:
         if sum(name.startswith(prefix) for name in self._sessions) >= limit:
-            self._drop_idle()
+            self.drop_idle()
         if sum(name.startswith(prefix) for name in self._sessions) >= limit:
             raise TooManyRequests(
                 f"key {prefix.rstrip('/')!r} holds {limit} sessions here, as many as it allows; close one"
@@ -288,19 +277,15 @@ class SessionTable(Generic[M]):
 
     def drop_idle(self) -> None:
         """Close sessions without a request for longer than the idle time."""
-        with self._lock:
-            self._drop_idle()
-
-    def _drop_idle(self) -> None:
         oldest = time.monotonic() - self._idle_s
-        for session_id in [s.id for s in self._sessions.values() if s.used < oldest]:
-            self._forget(session_id)
+        with self._lock:
+            for session_id in [s.id for s in self._sessions.values() if s.used < oldest]:
+                self._forget(session_id)
 
     def _forget(self, session_id: str, left: Version | None = None) -> None:
-        session = self._sessions.pop(session_id, None)
-        if session is not None:
+        if (session := self._sessions.pop(session_id, None)) is not None:
             self._remember(session_id, left or (session.steps, _ANY))
-            self._ended(session)
+            self.ended(session)
 
     def _remember(self, session_id: str, version: Version) -> None:
         self._left[session_id] = max(version, self._left.pop(session_id, version))

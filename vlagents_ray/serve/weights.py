@@ -36,24 +36,10 @@ from vlagents_ray.interface import POLICY, Agent
 from vlagents_ray.policies.base.accelerator import empty_cache, free_memory, is_out_of_memory
 from vlagents_ray.policies.compilation import CAPTURES
 from vlagents_ray.policies.wrapper import Wrapper
+from vlagents_ray.weights import trainable
 from vlagents_ray.weights.pinned_copies import beside_acts
 from vlagents_ray.weights.safetensors import ValueSpec, read_header
 from vlagents_ray.weights.shared_values import SharedValues, gpu_of, opened, readable_gpus
-from vlagents_ray.weights.trainable import (
-    accepted,
-    are_apart,
-    completed,
-    fingerprint,
-    from_host,
-    is_copied,
-    mapped,
-    on_host,
-    own_copy,
-    portable,
-    require_fit,
-    swap,
-    to_host,
-)
 
 logger = logging.getLogger(__name__)
 
@@ -155,9 +141,9 @@ class ModelWeights:
             policy: Any = agent
             while type(policy).load_parameters is Wrapper.load_parameters:
                 policy = policy.agent
-            own, copied = type(policy).load_parameters is not Agent.load_parameters, is_copied(values or {})
-            self._in_place, self._swaps = own or copied, copied and not own and are_apart(values or {})
-            first = WeightsVersion(0, fingerprint(values or {}), None if self._in_place else values)
+            own, copied = type(policy).load_parameters is not Agent.load_parameters, trainable.is_copied(values or {})
+            self._in_place, self._swaps = own or copied, copied and not own and trainable.are_apart(values or {})
+            first = WeightsVersion(0, trainable.fingerprint(values or {}), None if self._in_place else values)
             self.gpus = readable_gpus(gpu_of(values or {}))
             on_gpu = (value.device for value in (values or {}).values() if getattr(value, "is_cuda", False))
             self._device = next(on_gpu, "cpu")
@@ -198,11 +184,11 @@ class ModelWeights:
         kept = live if self._in_place and live is not None and live.values is None else None
         with beside_acts(self._device):  # all use of versions' memory is on that stream
             if kept is not None and version.values is not None and self._swaps and not version.on_host:
-                swap(self._agent.parameters(), version.values)
+                trainable.swap(self._agent.parameters(), version.values)
                 kept.values = version.values
             else:
                 if kept is not None:
-                    kept.values = mapped(own_copy, self._agent.parameters())
+                    kept.values = trainable.mapped(trainable.own_copy, self._agent.parameters())
                 if version.values is not None:  # otherwise the agent still has its own values
                     self._agent.load_parameters(version.values)
         self._live = version
@@ -235,7 +221,7 @@ class ModelWeights:
                 f"weights: got a header of {len(header)} bytes, want at most {most} for the policy's {len(held)} names"
             )
         announced = read_header(header)
-        require_fit(held, announced, partial=options.partial)
+        trainable.require_fit(held, announced, partial=options.partial)
         return announced
 
     def stage(
@@ -296,12 +282,12 @@ class ModelWeights:
     ) -> WeightsVersion:
         """Return a version of pushed values, which have been checked; missing names have the values of the newest."""
         with self._uncaptured(), opened(pushed) if isinstance(pushed, SharedValues) else nullcontext(pushed) as named:
-            new = accepted(self._held(newest), named, partial=options.partial)
+            new = trainable.accepted(self._held(newest), named, partial=options.partial)
             with self._busy if self._in_place else nullcontext():  # another version could become the agent's
                 held = self._agent.parameters() if newest.values is None else newest.values
-                values = completed(held, new, allow_same=options.allow_same, in_place=self._in_place)
+                values = trainable.completed(held, new, allow_same=options.allow_same, in_place=self._in_place)
             del held
-            return WeightsVersion(number, fingerprint(values), values)
+            return WeightsVersion(number, trainable.fingerprint(values), values)
 
     def admit(self, version: WeightsVersion) -> None:
         """Let `find` return a version while it is held."""
@@ -357,7 +343,10 @@ class ModelWeights:
     def portable_values(self, version: WeightsVersion) -> dict[str, Any]:
         """Return the values of a version as numpy arrays, for another process."""
         with self._uncaptured():
-            return {name: portable(value) for name, value in self._values(version).items()}
+            with self._busy if self._in_place else nullcontext():  # another version could become the agent's
+                values = self._agent.parameters() if version.values is None else version.values
+                values = trainable.mapped(trainable.own_copy, values) if self._in_place else values
+            return {name: trainable.portable(value) for name, value in values.items()}
 
     def sleep(self, *, offload: bool) -> None:
         """Free the memory that torch has cached and, with `offload`, that of all versions and graphs, until `wake`.
@@ -374,7 +363,7 @@ class ModelWeights:
                 self._asleep = True
                 self._agent.sleep()
                 held = [version.values for version in self._alive.values() if version.values is not None]
-                to_host([self._agent.parameters(), *held], self._moved)
+                trainable.to_host([self._agent.parameters(), *held], self._moved)
         free_memory()
 
     def wake(self) -> None:
@@ -387,7 +376,7 @@ class ModelWeights:
             if not self._asleep:
                 return
             try:
-                from_host(self._moved)
+                trainable.from_host(self._moved)
                 self._agent.wake()
             except RuntimeError as error:
                 if not is_out_of_memory(error):
@@ -420,18 +409,13 @@ class ModelWeights:
         with self._busy:
             return self._agent.parameters()
 
-    def _values(self, version: WeightsVersion) -> dict[str, Any]:
-        with self._busy if self._in_place else nullcontext():  # another version could become the agent's
-            values = self._agent.parameters() if version.values is None else version.values
-            return mapped(own_copy, values) if self._in_place else values
-
     def _move_to_host(self, used: set[WeightsVersion | None]) -> None:
         """Move the pinned and the newest version out of the GPU's memory, unless it is the agent's or one of `used`."""
         for version in {self.pinned, self.newest} - used:
             switches, values = self._switches, version.values
             if values is None or version.on_host:
                 continue
-            moved = mapped(on_host, values)
+            moved = trainable.mapped(trainable.on_host, values)
             with self._busy:
                 if self._switches == switches:  # otherwise another version may have got its memory
                     version.values, version.on_host = moved, True
@@ -489,8 +473,7 @@ class WeightUpdates:
             sessions: Returns the sessions, which act with them.
             acting: The lock that the policy's thread holds while it runs a batch.
         """
-        self.own = own
-        self._sessions = sessions
+        self.own, self._sessions = own, sessions
         self._acting = acting or threading.Lock()
         self._resting = threading.RLock()  # held during each step of a rest
         self._asleep: ModelWeights | None = None  # those of the policy that sleeps, for which `acting` is held

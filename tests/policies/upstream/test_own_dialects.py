@@ -15,8 +15,7 @@ from vlagents_ray.interface import Obs
 from vlagents_ray.policies.upstream import Upstream
 from vlagents_ray.protocol.messages import DEFAULT_LIMITS
 from vlagents_ray.serve.config.dialects import DialectArgs
-from vlagents_ray.serve.dialects.base import ReplicaContext
-from vlagents_ray.serve.dialects.routes import dialect_routes
+from vlagents_ray.serve.dialects.base import ReplicaContext, dialect_routes
 from vlagents_ray.serve.endpoints.access_middleware import AccessMiddleware
 from vlagents_ray.serve.endpoints.http import build_http_app
 from vlagents_ray.serve.engine.engine import Engine
@@ -42,7 +41,7 @@ def port() -> Iterator[int]:
     engine = Engine(Mirror(chunk=2))
     engine.start()
     routes = dialect_routes(DialectArgs(**DIALECTS), ReplicaContext(engine, lambda: METADATA, DEFAULT_LIMITS))
-    app = build_http_app(engine, lambda: METADATA, DEFAULT_LIMITS, dialects=routes)
+    app = build_http_app(engine, lambda: METADATA, DEFAULT_LIMITS, more=routes)
     with served(AccessMiddleware(app, None, "app")) as found:
         yield found
     engine.close()

@@ -25,9 +25,8 @@ from vlagents_ray.serve.access.api_keys import Keys
 from vlagents_ray.serve.access.key_store import new_key, revoke
 from vlagents_ray.serve.config.deployment import ServerArgs
 from vlagents_ray.serve.config.dialects import DialectArgs
-from vlagents_ray.serve.dialects.base import ReplicaContext
+from vlagents_ray.serve.dialects.base import ReplicaContext, dialect_routes
 from vlagents_ray.serve.dialects.openvla import OpenVLADialect
-from vlagents_ray.serve.dialects.routes import describe, dialect_routes, require_fit
 from vlagents_ray.serve.endpoints.access_middleware import AccessMiddleware
 from vlagents_ray.serve.endpoints.docs_page import docs_page
 from vlagents_ray.serve.endpoints.http import build_http_app
@@ -84,9 +83,7 @@ def test_dialects_count_in_the_statistics_by_their_names() -> None:
 
 def test_until_the_policy_is_loaded_every_dialect_answers_503() -> None:
     context = ReplicaContext(Engine(Mirror()), lambda: METADATA, LIMITS)
-    inside = build_http_app(
-        context.engine, lambda: METADATA, LIMITS, dialects=dialect_routes(DialectArgs(**ALL), context)
-    )
+    inside = build_http_app(context.engine, lambda: METADATA, LIMITS, more=dialect_routes(DialectArgs(**ALL), context))
     with TestClient(AccessMiddleware(inside, None, "app")) as client:
         assert client.get("/health").status_code == 503
         assert client.post("/act", json=body(1)).status_code == 503
@@ -131,23 +128,23 @@ def test_a_mapping_that_lacks_what_the_policy_needs_is_refused_at_the_start() ->
             return Act(np.zeros(7))
 
     with pytest.raises(ConfigError, match=r"dialects.openvla: camera 'wrist'"):
-        require_fit(args, Two.contract)
-    engine = Engine(Two(), check=lambda contract: require_fit(args, contract))
+        args.require_fit(Two.contract)
+    engine = Engine(Two(), check=args.require_fit)
     with pytest.raises(PolicyFailed, match="wrist"):
         engine.start()
 
 
 def test_what_is_on_stands_in_the_metadata_and_on_the_page() -> None:
-    told = describe(DialectArgs(**ALL))
+    told = DialectArgs(**ALL).describe()
     assert told["vla_eval"]["paths"] == ["WS /vla-eval"]
-    assert describe(DialectArgs(vla_eval={}))["vla_eval"]["paths"] == ["WS /", "WS /vla-eval"]  # type: ignore[arg-type]
+    assert DialectArgs(vla_eval={}).describe()["vla_eval"]["paths"] == ["WS /", "WS /vla-eval"]  # type: ignore[arg-type]
     assert told["openvla"]["mapping"]["instruction"] == "instruction"
     page = docs_page(METADATA | {"dialects": told})
     assert "WS /, WS /openpi" in page
     assert "Clients of OpenVLA. An episode is one request" in page
     assert "<code>reset</code> or a new <code>session_id</code> begins an episode" in page
     ports = {"gr00t": {"port": 5556, "host": "10.0.0.7"}, "vlagents": {}}
-    told = describe(DialectArgs(**ports))  # type: ignore[arg-type]
+    told = DialectArgs(**ports).describe()  # type: ignore[arg-type]
     assert {name: one["address"] for name, one in told.items()} == {
         "gr00t": "tcp://10.0.0.7:5556",
         "vlagents": "rpyc://127.0.0.1:8080",

@@ -14,7 +14,6 @@ from served_agents import Witness
 from vlagents_ray.errors import ConfigError, MissingDependency
 from vlagents_ray.serve.config.dialects import DialectArgs
 from vlagents_ray.serve.dialects import base
-from vlagents_ray.serve.dialects.routes import describe, require_packages
 from vlagents_ray.serve.endpoints.docs_page import docs_page
 from vlagents_ray.serve.launch.deployment_file import deployment
 
@@ -57,7 +56,7 @@ def test_a_dialect_registers_itself_by_an_entry_point(plain: str) -> None:
     row = acted({plain: {}})
     assert row[1] == 0.5
     assert row[3:] == [len("task 3"), 1]
-    told = describe(DialectArgs(**{plain: {}}))[plain]
+    told = DialectArgs(**{plain: {}}).describe()[plain]
     assert told["paths"] == ["POST /plain"]
     assert "Clients of the example" in docs_page(METADATA | {"dialects": {plain: told}})
 
@@ -81,7 +80,7 @@ def test_the_package_that_a_dialect_requires_is_asked_for_before_anything_starts
     plain: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     args = DialectArgs(**{plain: {}})
-    require_packages(args)
+    args.require_packages()
     monkeypatch.setattr(f"{PACKAGE}.PlainDialect.requires", ("no_such_package",))
     with pytest.raises(MissingDependency, match="no_such_package"):
-        require_packages(args)
+        args.require_packages()

@@ -33,7 +33,6 @@ from vlagents_ray.protocol.frames import Decoded, decode_replies, decode_request
 from vlagents_ray.protocol.messages import STREAM_BYTES, Budget, Limits, Reply, Request
 from vlagents_ray.serve.access.api_keys import NoKey
 from vlagents_ray.serve.endpoints import websocket
-from vlagents_ray.serve.endpoints.buffers import ReceiveBuffer, receive
 from vlagents_ray.serve.endpoints.websocket import WebSocketServer
 from vlagents_ray.serve.engine.engine import Engine
 
@@ -148,7 +147,7 @@ def test_who_stays_after_a_wrong_message_is_cut_off(
 def test_a_client_that_takes_no_replies_holds_up_nobody(
     endpoint: WebSocketServer, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("vlagents_ray.serve.endpoints.buffers._SLOW_S", 0.5)
+    monkeypatch.setattr("vlagents_ray.serve.endpoints.websocket._SLOW_S", 0.5)
     slow, other = stream(endpoint), stream(endpoint)
     for client in (slow, other):
         ask(client, "reset")
@@ -253,11 +252,11 @@ def test_an_endpoint_takes_a_free_port_of_those_it_may() -> None:
 SIZES = st.integers(0, 3000) | st.sampled_from([125, 126, 1023, 1024, 1025, 2**16 - 1, 2**16, 100_000])
 
 
-def connected() -> tuple[ServerProtocol, ReceiveBuffer]:
+def connected() -> tuple[ServerProtocol, websocket.ReceiveBuffer]:
     """Return a protocol after its handshake, and the buffer that is its reader."""
     protocol = ServerProtocol(max_size=2**20)
     protocol.state = State.OPEN
-    received = ReceiveBuffer()
+    received = websocket.ReceiveBuffer()
     received.attach(protocol)
     return protocol, received
 
@@ -273,7 +272,7 @@ def parsed_messages(stream: bytes, sizes: list[int]) -> list[bytes]:
             piece, stream = stream[:size], stream[size:]
             theirs.sendall(piece)
             while piece:
-                data, _ = receive(ours, len(piece))
+                data, _ = websocket.read_buffer.receive(ours, len(piece))
                 piece = piece[len(data) :]
                 received.parse(data)
                 messages += [event.data for event in protocol.events_received() if isinstance(event, Frame)]

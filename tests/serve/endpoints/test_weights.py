@@ -97,7 +97,7 @@ def serving(monkeypatch: pytest.MonkeyPatch) -> Iterator[Serving]:
         engine = Engine(agent or Gain())
         engine.start()
         routes = weights_routes(Alone(engine), slow_s, open_to_network=insecure)
-        inside = build_http_app(engine, dict, Limits(), others=routes)
+        inside = build_http_app(engine, dict, Limits(), more=routes)
         server = served(AccessMiddleware(inside, keys, "app"))
         opened.extend((server, engine))
         return SimpleNamespace(url=f"http://127.0.0.1:{server.__enter__()}", engine=engine)

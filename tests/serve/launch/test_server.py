@@ -171,7 +171,7 @@ def test_more_gpus_than_this_machine_has_are_refused_at_once(
     said: dict[str, Any], wanted: float, own: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A cluster that others started may get more: there it is said, and waited for."""
-    monkeypatch.setattr(server, "started_here", lambda: own)
+    monkeypatch.setattr(server.session, "started_here", lambda: own)
     monkeypatch.setattr(ray, "cluster_resources", lambda: {"GPU": wanted})
     server._require_gpus(deployment("noop", **said))
     if not wanted:
@@ -198,7 +198,7 @@ def test_more_gpus_than_this_machine_has_are_refused_before_a_ray_starts(
 
     monkeypatch.setattr(server, "_ray", start)
     monkeypatch.setattr(ray, "is_initialized", lambda: False)
-    monkeypatch.setattr(server, "gpus_here", lambda: float(gpus))
+    monkeypatch.setattr(server.private, "gpus_here", lambda: float(gpus))
     wanted = deployment("noop", resources={"num_gpus": 1}, replicas=2)
     said = None if gpus else "need 2 GPUs, this machine has 0; want less"
     with pytest.raises(NoRay if gpus else ConfigError, match=said), server.running_server(wanted):

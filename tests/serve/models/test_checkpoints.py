@@ -312,7 +312,7 @@ def test_a_session_that_closes_while_it_arrives_keeps_no_checkpoint(
         there.sessions.close(session.id)
 
     monkeypatch.setattr(there.sessions, "enter", closed_at_once)
-    there.transfer.adopt("s", state)
+    there.adopt("s", state)
     assert holders(there) == {"a/1": 0}
 
 
@@ -357,11 +357,11 @@ def test_a_session_that_moves_takes_its_checkpoint_along(serving: Callable[..., 
     state = export(here, "s")
     assert state is not None
     with pytest.raises(UnknownSession):
-        elsewhere.transfer.adopt("s", state, timeout_s=10)
+        elsewhere.adopt("s", state, timeout_s=10)
     assert elsewhere.models.describe()["loaded"] == ["a/1"], "it is not offered there"
     with pytest.raises(UnknownSession, match="'b' is not loaded here"):
-        there.transfer.adopt("s", state)
-    there.transfer.adopt("s", state, timeout_s=10)
+        there.adopt("s", state)
+    there.adopt("s", state, timeout_s=10)
     assert act(there, "s") == [2, 2]
     assert library.loads["b/2"] == 2
     wait_for(lambda: not any(model.sessions for model in here.models._cache.loaded.values()))
@@ -403,7 +403,7 @@ def test_sessions_move_between_replicas_with_the_same_weights_only(tmp_path: Pat
         file.write_bytes(content)
         engine = Engine(Stored(file))
         engine.start()
-        versions.append(engine.version)
+        versions.append(engine.models.version)
         engine.close()
     assert versions[0] == versions[1] != versions[2]
 
@@ -542,11 +542,11 @@ def test_a_third_waits_for_the_episodes_on_the_first(serving: Callable[..., Engi
 
 def test_replicas_with_different_settings_have_different_versions(serving: Callable[..., Engine]) -> None:
     here, there = serving(), serving()
-    assert here.version == there.version
+    assert here.models.version == there.models.version
     swapped(here, "b/2")
-    assert here.version != there.version
+    assert here.models.version != there.models.version
     swapped(there, "b/2")
-    assert here.version == there.version
+    assert here.models.version == there.models.version
 
 
 def test_a_swap_without_room_takes_that_of_a_choice(serving: Callable[..., Engine], library: Library) -> None:

@@ -42,7 +42,7 @@ class Others:
 @pytest.fixture
 def own() -> ReplicaView:
     engine = Engine(Noop.from_config({}))
-    return ReplicaView(engine, engine.observers, "own", "here", lambda: METADATA)
+    return ReplicaView(engine, "own", "here", lambda: METADATA)
 
 
 def test_pictures_go_to_those_who_show_them(own: ReplicaView) -> None:

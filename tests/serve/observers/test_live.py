@@ -242,7 +242,6 @@ def test_a_snapshot_and_what_is_sent_of_it_are_bounded(monkeypatch: pytest.Monke
     engine = Engine(Noop.from_config({}))
     view = ReplicaView(
         engine,
-        engine.observers,
         "this",
         "here",
         lambda: {"policy": "", "checkpoint": "", "weights": None, "policy_version": None},

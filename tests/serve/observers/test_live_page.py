@@ -176,7 +176,7 @@ def test_another_sites_page_sees_nothing_and_does_not_start_the_observer(
     wait_for(lambda: server.engine.observers.any is False)
     assert get(f"{server.url}/v1/live", headers)[0] == 403
     assert server.engine.observers.any is False
-    assert not server.fleet.watched
+    assert not server.fleet.viewers
 
 
 def test_a_server_open_to_the_network_shows_nothing() -> None:

@@ -204,7 +204,7 @@ def test_a_session_moves_between_replicas_with_all_its_state(engine: Engine, oth
     state = export(engine, "moving")
     assert state is not None
     assert "moving" not in engine.sessions
-    other.transfer.adopt("moving", state)
+    other.adopt("moving", state)
     told = info(ask(other, "moving", "act", 3))
     assert (told["seen"], told["acts"], told["pid"] != first["pid"]) == ([1, 2, 3], 2, True)
 

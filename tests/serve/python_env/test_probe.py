@@ -86,7 +86,7 @@ def test_another_python_or_ray_makes_a_child(monkeypatch: pytest.MonkeyPatch) ->
         ("ray", None, "it has no Ray, the cluster has"),
     ):
         versions = {key: value for key, value in {**found.versions, name: version}.items() if value is not None}
-        other = interpreter.EnvironmentProbe(sys.executable, versions)
+        other = interpreter.EnvironmentProbe(versions)
         monkeypatch.setattr(interpreter, "probe", lambda *_, other=other: other)
         assert with_process(args(python=sys.executable)).process == "child"
         with pytest.raises(ConfigError, match=rf"got 'replica', which cannot run in .*{said}.*use process 'child'"):

@@ -97,7 +97,7 @@ def serve(replicas: Replicas, number: int, method: str, *args: Any) -> Any:
 @contextlib.contextmanager
 def slow(engine: Engine, step: str) -> Iterator[tuple[queue.SimpleQueue[str], threading.Event]]:
     """Have a step of taking over a session wait for the event, and put something into the queue when it begins."""
-    begun, release, work = queue.SimpleQueue[str](), threading.Event(), getattr(engine.transfer, step)
+    begun, release, work = queue.SimpleQueue[str](), threading.Event(), getattr(engine, step)
 
     def waits(*args: Any) -> Any:
         begun.put("")
@@ -105,7 +105,7 @@ def slow(engine: Engine, step: str) -> Iterator[tuple[queue.SimpleQueue[str], th
         return work(*args)
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(engine.transfer, step, waits)
+        patch.setattr(engine, step, waits)
         yield begun, release
         release.set()
 
@@ -132,11 +132,11 @@ def test_an_older_episode_never_takes_the_place_of_a_newer_one_which_takes_its(
     state = export(a, "robot-1")
     assert state is not None
     with pytest.raises(UnknownSession, match="newer"):
-        b.transfer.adopt("robot-1", state)
+        b.adopt("robot-1", state)
     assert obeys(b) == ("episode 2", 1)
     newer = export(b, "robot-1")
     assert newer is not None
-    c.transfer.adopt("robot-1", newer)
+    c.adopt("robot-1", newer)
     assert obeys(c) == ("episode 2", 2)
 
 
@@ -150,7 +150,7 @@ def test_a_reset_under_way_is_not_overtaken_by_what_it_ends(replicas: Callable[[
     state = export(a, "robot-1")
     assert state is not None
     with pytest.raises(UnknownSession):
-        b.transfer.adopt("robot-1", state)
+        b.adopt("robot-1", state)
     Counting.gate.set()
     assert answers.get(timeout=20).error is None
     assert obeys(b) == ("episode 2", 1)
@@ -167,7 +167,7 @@ def test_a_reset_that_comes_late_ends_no_newer_episode(replicas: Callable[[int],
     ask(a, "reset", instruction="episode 2")
     state = export(a, "robot-1")
     assert state is not None
-    b.transfer.adopt("robot-1", state)
+    b.adopt("robot-1", state)
     Counting.gate.set()
     assert busy.get(timeout=20).error is None
     assert isinstance(late.get(timeout=20).error, UnknownSession)
@@ -181,11 +181,11 @@ def test_a_session_that_was_closed_does_not_come_back(replicas: Callable[[int], 
     ask(a, "reset", instruction="episode 1")
     state = export(a, "robot-1")
     assert state is not None
-    b.transfer.adopt("robot-1", state)
+    b.adopt("robot-1", state)
     ask(b, "act")
     ask(b, "close")
     with pytest.raises(UnknownSession, match="newer"):
-        b.transfer.adopt("robot-1", state)
+        b.adopt("robot-1", state)
     assert len(b.sessions) == 0
 
 
@@ -350,7 +350,7 @@ def test_an_act_whose_deadline_passed_while_its_session_was_fetched_is_not_execu
     served = replicas(2)
     a, b = served.engines
     ask(a, "reset", instruction="episode 1")
-    with slow(b, "prepare") as (_, release):
+    with slow(b, "prepare_adoption") as (_, release):
 
         async def late(timed: bool) -> list[Reply]:
             request = Request("act", Obs(), deadline_ms=50)
@@ -376,7 +376,7 @@ def test_an_act_whose_client_has_gone_while_its_session_was_fetched_is_not_execu
 ) -> None:
     a, b = replicas(2).engines
     ask(a, "reset", instruction="episode 1")
-    with slow(b, "prepare") as (begun, release):
+    with slow(b, "prepare_adoption") as (begun, release):
 
         async def go() -> None:
             sender = Sender(b, "http", "robot-1", connected=False, caller=NoKey.OPEN)

@@ -63,8 +63,7 @@ class Keys:
             read: Returns the text of the key file.
             changed: Returns an object that differs when the text may have changed.
         """
-        self._read = read
-        self._changed = changed
+        self._read, self._changed = read, changed
         self._keys: dict[bytes, Key] = {}
         self._buckets: dict[str, _Bucket] = {}
         self._held: Counter[str] = Counter()  # number of connections, by the key's name
@@ -193,7 +192,6 @@ class Keys:
             self._unreadable = None
 
     def _handle_unreadable(self, error: Exception, now: float) -> None:
-        """Handle a failed attempt to read the file."""
         first = self._unreadable is None
         since = self._unreadable = now if self._unreadable is None else self._unreadable
         self._state = _UNREAD
@@ -402,8 +400,7 @@ class ScopeCheck:
     """
 
     def __init__(self, subject: str, *, open_to_network: bool) -> None:
-        self._subject = subject
-        self._open_to_network = open_to_network
+        self._subject, self._open_to_network = subject, open_to_network
 
     def require(self, scope: str | None) -> None:
         """Check the key of the current request, and its scope if one is given.

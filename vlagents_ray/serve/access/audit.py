@@ -14,9 +14,9 @@ keys. Refusals have the level WARNING, all other events INFO.
 from __future__ import annotations
 
 import logging
+import math
 import threading
 import time
-from dataclasses import dataclass
 
 LOG = "vlagents_ray.serve.audit"  # users' logging configurations refer to this name
 logger = logging.getLogger(LOG)
@@ -38,17 +38,12 @@ def log_pressed(name: str, what: str) -> None:
     logger.info("key %s: pressed %s", name or "(none)", what)
 
 
-@dataclass(slots=True)
-class _Kind:
-    logged: float  # time of the last line, s, monotonic
-    left_out: int = 0
-
-
 class Audit:
     """Writes the audit log; thread-safe. Only names of known keys are passed, which bounds the number of kinds."""
 
     def __init__(self) -> None:
-        self._kinds: dict[tuple[str, str], _Kind] = {}
+        # By name and event: time of the last line, s, monotonic, and the number of events since then.
+        self._kinds: dict[tuple[str, str], tuple[float, int]] = {}
         self._lock = threading.Lock()
 
     def did(self, name: str, what: str, of: str) -> None:
@@ -65,12 +60,8 @@ class Audit:
         """Return the suffix of the line to log, or None if such an event was logged within `_EVERY_S`."""
         now = time.monotonic()
         with self._lock:
-            kind = self._kinds.get((name, what))
-            if kind is None:
-                self._kinds[name, what] = _Kind(now)
-                return ""
-            if now - kind.logged < _EVERY_S:
-                kind.left_out += 1
-                return None
-            left_out, kind.left_out, kind.logged = kind.left_out, 0, now
-        return f" ({left_out} more like this since the last line)" if left_out else ""
+            logged, left_out = self._kinds.get((name, what), (-math.inf, 0))
+            due = now - logged >= _EVERY_S
+            self._kinds[name, what] = (now, 0) if due else (logged, left_out + 1)
+        more = f" ({left_out} more like this since the last line)" if left_out else ""
+        return more if due else None

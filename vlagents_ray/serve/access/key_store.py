@@ -157,7 +157,7 @@ def _change(file: Path, change: Callable[[list[Key]], list[Key]]) -> None:
     The new file has the owner of the old one; otherwise a server could not read it, and would accept the old keys for
     some time. If the owner cannot be preserved, nothing is changed and `ConfigError` is raised.
     """
-    with _locked(file):
+    with _locked(file) as folder:
         keys = change(read_keys(file))
         stated = [
             {name: value for name, value in asdict(key).items() if value not in (None, (), False)} for key in keys
@@ -174,12 +174,7 @@ def _change(file: Path, change: Callable[[list[Key]], list[Key]]) -> None:
         except BaseException:
             Path(name).unlink(missing_ok=True)
             raise
-        # Write the folder to disk, so that a revocation survives a power failure.
-        descriptor = os.open(file.parent, os.O_RDONLY)
-        try:
-            os.fsync(descriptor)
-        finally:
-            os.close(descriptor)
+        os.fsync(folder)  # so that a revocation survives a power failure
 
 
 def _belong(descriptor: int, file: Path) -> None:
@@ -202,14 +197,14 @@ def _belong(descriptor: int, file: Path) -> None:
 
 
 @contextlib.contextmanager
-def _locked(file: Path) -> Iterator[None]:
-    """Hold a lock on the file's folder, so that no change is lost when two commands run at once."""
+def _locked(file: Path) -> Iterator[int]:
+    """Hold a lock on the file's folder, whose descriptor is yielded, so that no change of two commands is lost."""
     try:
         descriptor = os.open(file.parent, os.O_RDONLY)
     except OSError as error:
         raise ConfigError(f"keys file {file}: no such folder ({error.strerror})") from error
     try:
         fcntl.flock(descriptor, fcntl.LOCK_EX)
-        yield
+        yield descriptor
     finally:
         os.close(descriptor)

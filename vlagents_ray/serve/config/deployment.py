@@ -66,14 +66,8 @@ class EnvironmentArgs(_DeploymentModel):
 
     def runtime_env(self) -> dict[str, Any]:
         """Return Ray's `runtime_env` of the replica; empty if the policy runs in a child process."""
-        if self.process == "child":
-            return {}
-        found: dict[str, Any] = {}
-        if self.python is not None:
-            found["py_executable"] = self.python
-        if self.env_vars:
-            found["env_vars"] = self.env_vars
-        return found
+        stated = {"py_executable": self.python, "env_vars": self.env_vars}
+        return {} if self.process == "child" else {name: value for name, value in stated.items() if value}
 
 
 class BatchArgs(_DeploymentModel):
@@ -129,12 +123,7 @@ class CheckpointArgs(_DeploymentModel):
         return choices
 
     def of(self, make: Callable[[Mapping[str, Any]], Agent], config: Mapping[str, Any]) -> Checkpoints:
-        """Return the checkpoints of a policy.
-
-        Args:
-            make: Builds the policy from its settings.
-            config: The deployment's own settings of the policy.
-        """
+        """Return the checkpoints of a policy that `make` builds; `config` are the deployment's own settings of it."""
         return Checkpoints(make, config, self.choices, steps=self.steps, loaded=self.loaded)
 
 
@@ -249,16 +238,11 @@ class AccessArgs(_DeploymentModel):
     plain_http: bool = Field(
         default=False, description="keys may cross the network unencrypted: no warning (TLS ends elsewhere, a VPN)"
     )
-    hosts: list[str] = Field(
+    hosts: list[Annotated[str, AfterValidator(str.lower)]] = Field(
         default_factory=list,
         description="without keys: names in the public DNS by which clients reach the server; its addresses, names "
         "without a dot and those of private networks need not be stated",
     )
-
-    @field_validator("hosts")
-    @classmethod
-    def _lower(cls, value: list[str]) -> list[str]:
-        return [host.lower() for host in value]
 
     @model_validator(mode="after")
     def _one(self) -> AccessArgs:

@@ -11,22 +11,21 @@ from collections.abc import Iterator, Mapping
 from functools import cache
 from typing import Any
 
-from pydantic import BaseModel, ConfigDict, Field, create_model, field_validator, model_validator
+from pydantic import BaseModel, Field, create_model, field_validator, model_validator
 from pydantic.fields import FieldInfo
 
+from vlagents_ray.contract import Contract
 from vlagents_ray.errors import ConfigError
 from vlagents_ray.protocol.messages import RankName
-from vlagents_ray.registry import DIALECTS, dialect_class, names
+from vlagents_ray.registry import DIALECTS, dialect_class, names, require
 from vlagents_ray.wire import presets as wire_presets
 from vlagents_ray.wire.mapping import KeyMapping
 
 MappingSetting = str | dict[str, Any]
 
 
-class DialectConfig(BaseModel):
+class DialectConfig(BaseModel, extra="forbid"):
     """The settings that all dialects have; the `Config` of a dialect adds its own."""
-
-    model_config = ConfigDict(extra="forbid")
 
     mapping: MappingSetting | None = Field(
         default=None,
@@ -66,10 +65,8 @@ class KeylessPortConfig(PortConfig):
     )
 
 
-class DialectArgs(BaseModel):
+class DialectArgs(BaseModel, extra="allow"):
     """The settings of all dialects that are on, by name."""
-
-    model_config = ConfigDict(extra="allow")
 
     @model_validator(mode="before")
     @classmethod
@@ -98,6 +95,43 @@ class DialectArgs(BaseModel):
     def gateways(self) -> dict[str, PortConfig]:
         """Return the settings of the dialects that have their own port, by name."""
         return {name: one for name, one in self.on().items() if isinstance(one, PortConfig)}
+
+    def at_root(self) -> list[str]:
+        """Return the dialects at the root: the first one that has a root, and others with the same protocol there."""
+        roots = {name: getattr(dialect_class(name), "root", "") for name in self.on()}
+        first = next(filter(None, roots.values()), None)
+        return [name for name, root in roots.items() if root == first]
+
+    def describe(self) -> dict[str, Any]:
+        """Describe the enabled dialects for the metadata: addresses, clients and mapping by name."""
+        found: dict[str, Any] = {}
+        for name, config in self.on().items():
+            cls, mapping = dialect_class(name), config.keys()
+            found[name] = {
+                **cls.places(config),
+                "clients": cls.clients,
+                "summary": cls.summary,
+                "mapping": None if mapping is None else mapping.to_json(),
+            }
+        for name in self.at_root():
+            found[name]["paths"].insert(0, "WS /")
+        return found
+
+    def require_fit(self, contract: Contract | None) -> None:
+        """Raise `ConfigError` if the policy needs a part of the observation that a dialect's mapping lacks."""
+        found = [
+            f"- dialects.{name}: {line}"
+            for name, config in self.on().items()
+            for line in dialect_class(name).lacks(config, contract)
+        ]
+        if found:
+            raise ConfigError("dialects and policy do not fit:\n" + "\n".join(found))
+
+    def require_packages(self) -> None:
+        """Raise `MissingDependency` if an enabled dialect needs a package that is not installed."""
+        for name in self.on():
+            for module in dialect_class(name).requires:
+                require(module)
 
     @classmethod
     def registered_fields(cls) -> dict[str, FieldInfo]:

@@ -46,7 +46,8 @@ import numpy as np
 from starlette.requests import ClientDisconnect
 from starlette.requests import Request as HttpRequest
 from starlette.responses import Response
-from starlette.routing import BaseRoute, Route, WebSocketRoute
+from starlette.routing import BaseRoute, Match, Route, WebSocketRoute
+from starlette.types import Scope
 from starlette.websockets import WebSocket
 
 from vlagents_ray.client.agent import RemoteAgent
@@ -62,18 +63,20 @@ from vlagents_ray.errors import (
 from vlagents_ray.interface import Obs
 from vlagents_ray.protocol.frames import Decoded
 from vlagents_ray.protocol.messages import DEFAULT_LIMITS, SESSION_HEADER, Budget, Limits, Op, RankName, Reply, Request
-from vlagents_ray.serve.access.api_keys import Caller, Identity, NoKey, current_caller
-from vlagents_ray.serve.config.dialects import DialectConfig, KeylessPortConfig, PortConfig, read_mapping
+from vlagents_ray.registry import dialect_class
+from vlagents_ray.serve.access.api_keys import Identity, NoKey, caller_name, current_caller
+from vlagents_ray.serve.config.dialects import DialectArgs, DialectConfig, KeylessPortConfig, PortConfig, read_mapping
 from vlagents_ray.serve.endpoints.http_messages import (
     LONG_BYTES,
     RequestDecoder,
     problem_response,
+    public_problem,
     request_id,
     session_id,
 )
 from vlagents_ray.serve.engine.admission import Admission, MessageAdmission
 from vlagents_ray.serve.engine.engine import Engine
-from vlagents_ray.serve.engine.sender import Sender
+from vlagents_ray.serve.engine.sender import Sender, settle
 from vlagents_ray.serve.ports import LOOPBACK
 from vlagents_ray.serve.requests import Message
 
@@ -133,9 +136,7 @@ class Dialect(abc.ABC):
     presets: ClassVar[Mapping[str, Mapping[str, Any]]] = {}  # mappings that deployment files may name
 
     def __init__(self, name: str, config: DialectConfig, context: ReplicaContext | GatewayContext) -> None:
-        self.name = name
-        self.config = config
-        self.context = context
+        self.name, self.config, self.context = name, config, context
         self.mapping = config.keys() or read_mapping(_OUR_NAMES)
 
     @classmethod
@@ -180,7 +181,11 @@ class RouteDialect(Dialect):
 
     def routes(self) -> list[BaseRoute]:
         """Return the routes of the dialect's paths, without the root."""
-        return [_route(getattr(self, method), *path.split()) for path, method in self.paths.items()]
+        served = ((*path.split(), getattr(self, name)) for path, name in self.paths.items())
+        return [
+            WebSocketRoute(path, handler) if method == "WS" else Route(path, handler, methods=[method])
+            for method, path, handler in served
+        ]
 
     def at_root(self, sharing: Sequence[Any]) -> Stream:
         """Serve WebSockets at the server's root for all dialects with this protocol there, beginning with this one."""
@@ -258,8 +263,28 @@ class PortDialect(Dialect):
         """Stop accepting clients, and end all sessions."""
 
 
-def _route(endpoint: Callable[..., Any], method: str, path: str) -> BaseRoute:
-    return WebSocketRoute(path, endpoint) if method == "WS" else Route(path, endpoint, methods=[method])
+class Root(WebSocketRoute):
+    """The application's root, with or without a slash at its end: `ws://host:port`, `ws://host:port/app`."""
+
+    def matches(self, scope: Scope) -> tuple[Match, Scope]:
+        """Match a WebSocket at the root."""
+        path = scope.get("path", "").removeprefix(scope.get("root_path", ""))
+        if scope["type"] == "websocket" and path in ("", "/"):
+            return Match.FULL, {"endpoint": self.endpoint, "path_params": {}}
+        return Match.NONE, {}
+
+
+def dialect_routes(args: DialectArgs, context: ReplicaContext) -> list[BaseRoute]:
+    """Return the routes of the dialects on the server's own port."""
+    dialects: dict[str, RouteDialect] = {
+        name: dialect_class(name)(name, config, context)
+        for name, config in args.on().items()
+        if name not in args.gateways()
+    }
+    routes = [route for dialect in dialects.values() for route in dialect.routes()]
+    if sharing := [dialects[name] for name in args.at_root()]:
+        routes.append(Root("/", sharing[0].at_root(sharing)))
+    return routes
 
 
 async def decoded(read: Callable[[bytes, Budget], T], data: bytes | None, admission: MessageAdmission) -> T:
@@ -272,14 +297,6 @@ async def decoded(read: Callable[[bytes, Budget], T], data: bytes | None, admiss
         raise MalformedMessage("message: got text, want a binary map")
     admission.begin("act")
     return await admission.decoded(partial(read, data), long=len(data) > LONG_BYTES)
-
-
-def public_problem(error: Exception, what: str, request_id: str) -> VLAgentsError:
-    """Return the error that a client may see; details of an unexpected error are only logged."""
-    if isinstance(error, VLAgentsError):
-        return error
-    logger.error("%s failed (request %s)", what, request_id, exc_info=error)
-    return VLAgentsError("internal error; the server's log has the details")
 
 
 async def accept_or_refuse(websocket: WebSocket, context: ReplicaContext) -> bool:
@@ -338,8 +355,7 @@ class ImplicitSession:
 
     def __init__(self, engine: Engine, sender: Sender, rank: RankName = "robot", name: str = "") -> None:
         self.episode = ImplicitEpisode()
-        self._engine = engine
-        self._sender = sender
+        self._engine, self._sender = engine, sender
         self._rank: RankName = rank
         self._name = name
 
@@ -480,11 +496,7 @@ class HttpDialect(RouteDialect):
 
     async def end_episode(self, http: HttpRequest) -> Response:
         """Answer `{}`, and make the next observation of the session in the header begin an episode."""
-        name = request_id(http)
-        try:
-            (await self._kept_session(session_id(http))).episode.end()
-        except VLAgentsError as error:
-            return problem_response(error, name)
+        (await self._kept_session(session_id(http))).episode.end()
         return Response(b"{}", media_type="application/json")
 
     async def _kept_session(self, name: str) -> ImplicitSession:
@@ -504,13 +516,8 @@ class HttpDialect(RouteDialect):
 
     async def _fetch(self, session_id: str) -> None:
         """Fetch a session of a client that another replica has served so far, with its state."""
-        engine, caller = self.context.engine, current_caller()
-        if engine.finder is None or session_id in engine.sessions:
-            return
-        loop, over = asyncio.get_running_loop(), asyncio.Event()
-
-        def finished() -> None:
-            loop.call_soon_threadsafe(over.set)
-
-        if engine.finder.fetch(session_id, finished, caller.name if isinstance(caller, Caller) else ""):
-            await over.wait()
+        engine = self.context.engine
+        if engine.finder is not None and session_id not in engine.sessions:
+            over: asyncio.Future[None] = asyncio.get_running_loop().create_future()
+            if engine.finder.fetch(session_id, partial(settle, over, None), caller_name()):
+                await over

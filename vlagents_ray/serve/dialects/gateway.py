@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-import logging
 from functools import partial
 from typing import Any
 
@@ -18,11 +17,8 @@ from vlagents_ray.serve.access.api_keys import NoKey, require_access
 from vlagents_ray.serve.access.audit import write_audit
 from vlagents_ray.serve.config.deployment import ServerArgs
 from vlagents_ray.serve.dialects.base import Connect, GatewayContext, PortDialect
-from vlagents_ray.serve.dialects.routes import describe, require_fit
 from vlagents_ray.serve.engine.admission import Admission
 from vlagents_ray.serve.ports import LOOPBACK, reserve
-
-logger = logging.getLogger(__name__)
 
 _LOADING_S = 3600.0  # time limit for loading the policy; a failure is raised at once
 _ANSWER_S = 30.0
@@ -34,13 +30,12 @@ class Gateway:
     async def __init__(self, args: dict[str, Any]) -> None:  # type: ignore[misc]  # Serve awaits it
         self._dialects: list[PortDialect] = []
         settings = ServerArgs(**args)
-        self._description = describe(settings.dialects)
+        self._description = settings.dialects.describe()
         await asyncio.to_thread(self._open, settings)
 
     def _open(self, args: ServerArgs) -> None:
         wanted = args.dialects.gateways()
-        keys = args.access.keys()
-        if keys is not None:
+        if (keys := args.access.keys()) is not None:
             write_audit()
         for one in wanted.values():
             require_access(one.host or LOOPBACK, keys, args.access.insecure)
@@ -48,7 +43,7 @@ class Gateway:
         try:
             app = serve.get_replica_context().app_name
             contract = wait_for_policy(app)
-            require_fit(args.dialects, contract)
+            args.dialects.require_fit(contract)
             limits = args.limits.limits()
             admission = Admission(limits.in_flight_bytes)
             for name, one in wanted.items():
@@ -71,7 +66,7 @@ class Gateway:
             raise
 
     async def description(self) -> dict[str, Any]:
-        """Return the description of the dialects for the metadata of replicas, see `describe`."""
+        """Return the description of the dialects for the metadata of replicas, see `DialectArgs.describe`."""
         return self._description
 
     def check_health(self) -> None:

@@ -33,8 +33,7 @@ class GatewaySessions:
 
     def __init__(self, connect: Connect, contract: Contract | None) -> None:
         """Prepare the sessions; `show` must be called first, with the client. `contract` is the policy's."""
-        self._connect = connect
-        self._contract = contract
+        self._connect, self._contract = connect, contract
         self._caller: Identity | None = None
         self._key: str | None = None
         self._rank: RankName | None = None

@@ -301,8 +301,7 @@ class GR00TDialect(PortDialect):
             self._take(tuple(envelope), payload, parts[-1].get(zmq.SRCFD))
 
     def _take(self, envelope: Envelope, payload: bytes, descriptor: int) -> None:
-        client = self._clients.get(envelope)
-        if client is None:
+        if (client := self._clients.get(envelope)) is None:
             answer = partial(self.answer, envelope)
             try:
                 client = self._clients.add(envelope, lambda: GR00TConnection(self.context, self.mapping, answer))
@@ -329,8 +328,7 @@ class _Strangers:
         """Monitor connections; `most_bytes` limits the bytes of all these connections together, and of one message."""
         self.monitor = router.get_monitor_socket(zmq.EVENT_ACCEPTED | zmq.EVENT_DISCONNECTED)
         self._router, self._zmq = router, zmq
-        self._port = port
-        self._most_bytes = most_bytes
+        self._port, self._most_bytes = port, most_bytes
         self._since: dict[int, tuple[socket.socket, float]] = {}  # by the descriptor in ZeroMQ, oldest first
         self._clients: dict[int, GR00TConnection] = {}
 
@@ -399,7 +397,6 @@ class _Strangers:
 
 
 def _received(connection: socket.socket) -> int:
-    """Return the number of bytes that a connection has received."""
     try:
         info = connection.getsockopt(socket.IPPROTO_TCP, socket.TCP_INFO, _RECEIVED_AT + _RECEIVED.size)
     except OSError:  # the connection has ended

@@ -76,8 +76,7 @@ class LeRobotConnection(GatewayClient):
 
     def __init__(self, context: GatewayContext, mapping: KeyMapping, checkpoint: str | None) -> None:
         super().__init__(context)
-        self._mapping = mapping
-        self._checkpoint = checkpoint
+        self._mapping, self._checkpoint = mapping, checkpoint
         self.sessions.show(NoKey.OPEN, None)  # the protocol has no key, and the deployment accepted that
         self._robot: PolicyInstructions | None = None
         self._acted = -1  # time step of the last observation that the policy received
@@ -112,10 +111,7 @@ class LeRobotConnection(GatewayClient):
         """Store an observation for the next act, in place of an earlier one that the policy has not received yet.
 
         An observation of a time step that the policy has received is ignored, unless the client has no action left.
-
-        Args:
-            data: The pickle.
-            admission: The admission of the message, which is released when the observation is dropped or acted on.
+        The `admission` of the pickle is released when the observation is dropped or acted on.
         """
         if self._robot is None:
             raise NotReset("SendPolicyInstructions: got none since Ready; start the client again")
@@ -222,9 +218,16 @@ class LeRobotDialect(PortDialect):
         self._ipv4 = listener.family == socket.AF_INET
         host, port = listener.getsockname()[:2]
         most = _REQUESTS * self.context.sessions
+        unary, stream = grpc.unary_unary_rpc_method_handler, grpc.stream_unary_rpc_method_handler
+        methods = {  # over plain bytes
+            "Ready": unary(partial(self._answer, grpc, self._ready)),
+            "SendPolicyInstructions": unary(partial(self._answer, grpc, self._set_up)),
+            "SendObservations": stream(partial(self._answer, grpc, self._observe)),
+            "GetActions": unary(partial(self._answer, grpc, self._act)),
+        }
         self._server = grpc.server(
             ThreadPoolExecutor(most, "lerobot-client"),
-            handlers=[grpc.method_handlers_generic_handler(lerobot.SERVICE, self._methods(grpc))],
+            handlers=[grpc.method_handlers_generic_handler(lerobot.SERVICE, methods)],
             options=[
                 ("grpc.so_reuseport", 0),  # otherwise another process could share the port
                 ("grpc.max_concurrent_streams", _REQUESTS),
@@ -255,20 +258,10 @@ class LeRobotDialect(PortDialect):
         if self._thread.is_alive():
             self._thread.join(_END_S)
 
-    def _methods(self, grpc: Any) -> dict[str, Any]:
-        """Return the service's methods, over plain bytes."""
-        unary, stream = grpc.unary_unary_rpc_method_handler, grpc.stream_unary_rpc_method_handler
-        return {
-            "Ready": unary(partial(self._answer, grpc, self._ready)),
-            "SendPolicyInstructions": unary(partial(self._answer, grpc, self._set_up)),
-            "SendObservations": stream(partial(self._answer, grpc, self._observe)),
-            "GetActions": unary(partial(self._answer, grpc, self._act)),
-        }
-
-    def _answer(self, grpc: Any, method: Callable[[Any, Any], bytes], request: Any, context: Any) -> bytes:
+    def _answer(self, grpc: Any, method: Callable[[Any, Any], bytes | None], request: Any, context: Any) -> bytes:
         """Return the reply to a request, or end the request with gRPC's status for the error."""
         try:
-            return method(request, context)
+            return method(request, context) or lerobot.EMPTY
         except VLAgentsError as error:
             status, text = _STATUS.get(error.status, "INTERNAL"), f"{error.code}: {error}"
         except Exception as error:  # noqa: BLE001 - logged, and answered
@@ -278,23 +271,21 @@ class LeRobotDialect(PortDialect):
         context.abort(getattr(grpc.StatusCode, status), text[:_DETAILS])
         raise AssertionError  # abort raises
 
-    def _ready(self, _: bytes, context: Any) -> bytes:
+    def _ready(self, _: bytes, context: Any) -> None:
         if self._closing.is_set():
             raise PolicyUnavailable("the server is stopping; connect again")
         if self._ipv4 and context.peer().startswith("ipv6:"):  # gRPC also listens there if the host is 0.0.0.0
             raise Forbidden("this server is for IPv4; connect to such an address, or set dialects.lerobot.host to '::'")
         make = partial(LeRobotConnection, self.context, self.mapping, self.config.checkpoint)
         self._clients.add(context.peer(), make)
-        return lerobot.EMPTY
 
-    def _set_up(self, message: bytes, context: Any) -> bytes:
+    def _set_up(self, message: bytes, context: Any) -> None:
         with self._client(context) as client:
             if (data := lerobot.read_data(message)) is None:
                 raise MalformedMessage("policy instructions: got none")
             client.set_up(lerobot.read_instructions(data, self.context.limits))
-        return lerobot.EMPTY
 
-    def _observe(self, parts: Iterator[bytes], context: Any) -> bytes:
+    def _observe(self, parts: Iterator[bytes], context: Any) -> None:
         with self._client(context) as client:
             robot = self.config.rank == "robot"
             admission = MessageAdmission(self.context.admission, self.context.limits, None, robot=robot, inline=False)
@@ -304,18 +295,16 @@ class LeRobotDialect(PortDialect):
             finally:
                 del self._uploads[context]
             client.observe(data, admission)
-        return lerobot.EMPTY
 
-    def _act(self, _: bytes, context: Any) -> bytes:
+    def _act(self, _: bytes, context: Any) -> bytes | None:
         with self._client(context) as client:
             actions = client.actions()
-        return lerobot.EMPTY if actions is None else lerobot.write_data(actions)
+        return None if actions is None else lerobot.write_data(actions)
 
     @contextlib.contextmanager
     def _client(self, context: Any) -> Iterator[LeRobotConnection]:
         """Yield the client of a request, identified by its connection."""
-        client = self._clients.get(context.peer())
-        if client is None:
+        if (client := self._clients.get(context.peer())) is None:
             raise NotReset("Ready: got none over this connection, or it was idle for too long; start the client again")
         with client.request():
             yield client

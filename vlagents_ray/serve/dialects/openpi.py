@@ -1,8 +1,8 @@
-"""openpi's clients over WebSocket: requests and replies are binary maps, and the server sends the first message.
+"""openpi's and RoboArena's clients over WebSocket: requests and replies are binary maps; the server sends first.
 
-RoboArena's clients (`roboarena.py`) use nearly the same protocol and also connect to the root. Both dialects may be on:
-RoboArena's requests name an `endpoint`, openpi's do not. The first message is then RoboArena's configuration, which
-openpi's client takes for metadata.
+RoboArena's clients use nearly the same protocol and also connect to the root. Both dialects may be on: RoboArena's
+requests name an `endpoint`, openpi's do not. The first message is then RoboArena's configuration, which openpi's client
+takes for metadata.
 
 An error is a text with a request id, after which the connection is closed (1011) except for 429; openpi's own server
 sends a traceback.
@@ -18,45 +18,35 @@ import abc
 import time
 import uuid
 from collections.abc import Mapping, Sequence
-from typing import Any, ClassVar
+from functools import partial
+from typing import Any, ClassVar, Literal
 
 import numpy as np
 from pydantic import Field
 from starlette.websockets import WebSocket, WebSocketDisconnect
 
 from vlagents_ray.errors import MalformedMessage, TooManyRequests, VLAgentsError, shown
-from vlagents_ray.protocol.messages import Reply
+from vlagents_ray.protocol.messages import NAME_CHARACTERS, Reply
 from vlagents_ray.serve.config.dialects import DialectConfig, MappingSetting
-from vlagents_ray.serve.dialects.base import (
-    INTERNAL_ERROR,
-    POLICY_VIOLATION,
-    ImplicitSession,
-    RouteDialect,
-    SessionObs,
-    Stream,
-    accept_or_refuse,
-    act_together,
-    decoded,
-    public_problem,
-)
+from vlagents_ray.serve.dialects import base
+from vlagents_ray.serve.endpoints.http_messages import public_problem
 from vlagents_ray.serve.engine.admission import MessageAdmission
 from vlagents_ray.serve.engine.sender import REFUSED, Sender
 from vlagents_ray.serve.requests import Message
 from vlagents_ray.wire import openpi
-from vlagents_ray.wire.openpi import PRESETS
 
 
-class MapDialect(RouteDialect):
+class MapDialect(base.RouteDialect):
     """A dialect whose messages are maps in openpi's encoding; all such dialects share the server's root."""
 
     root = "openpi"
 
     async def stream(self, socket: WebSocket) -> None:
         """Serve one connection at this dialect's path."""
-        await MapEndpoint([self]).stream(socket)
+        await _stream([self], socket)
 
-    def at_root(self, sharing: Sequence[MapDialect]) -> Stream:
-        return MapEndpoint(sharing).stream
+    def at_root(self, sharing: Sequence[MapDialect]) -> base.Stream:
+        return partial(_stream, sharing)
 
     @abc.abstractmethod
     def first(self) -> dict[str, Any]:
@@ -125,7 +115,7 @@ class OpenPiDialect(MapDialect):
         "text, then close 1011."
     )
     paths: ClassVar[Mapping[str, str]] = {"WS /openpi": "stream"}
-    presets = PRESETS
+    presets = openpi.PRESETS
     config: OpenPiDialectConfig
 
     def first(self) -> dict[str, Any]:
@@ -152,15 +142,70 @@ class OpenPiDialect(MapDialect):
         return batch
 
 
+class RoboArenaDialectConfig(DialectConfig):
+    """The settings of RoboArena's client; except for `bare`, the fields are those of its PolicyServerConfig."""
+
+    mapping: MappingSetting = "roboarena"
+    image_resolution: tuple[int, int] | None = Field(default=(224, 224), description="height, width; null: any")
+    needs_wrist_camera: bool = True
+    n_external_cameras: int = Field(default=1, ge=0, le=2)
+    needs_stereo_camera: bool = False
+    needs_session_id: bool = False
+    action_space: Literal["joint_position", "joint_velocity", "cartesian_position", "cartesian_velocity"] = (
+        "joint_position"
+    )
+    bare: bool = Field(default=False, description="answer the array itself, as older clients want it")
+
+
+class RoboArenaDialect(MapDialect):
+    """RoboArena's protocol: an episode ends with `reset`, or with another `session_id`."""
+
+    Config = RoboArenaDialectConfig
+    clients = "RoboArena"
+    summary = (
+        "A session is the connection; `reset` or a new `session_id` begins an episode. An error is a text, "
+        "then close 1011."
+    )
+    paths: ClassVar[Mapping[str, str]] = {"WS /roboarena": "stream"}
+    presets = openpi.ROBOARENA
+    config: RoboArenaDialectConfig
+
+    def first(self) -> dict[str, Any]:
+        ours = {"mapping", "rank", "bare"}
+        return self.config.model_dump(mode="json", include=RoboArenaDialectConfig.model_fields.keys() - ours)
+
+    def speaks(self, message: dict[str, Any]) -> bool:
+        return "endpoint" in message
+
+    def begins(self, message: dict[str, Any], connection: MapConnection) -> bytes | str | None:
+        endpoint = message.get("endpoint", "infer")
+        if not isinstance(endpoint, str) or endpoint not in ("infer", "reset"):
+            raise MalformedMessage(f"endpoint: got {shown(endpoint)}, want 'infer' or 'reset'")
+        if endpoint == "reset":
+            connection.end_episodes()
+            return "reset successful"
+        if (named := message.get("session_id")) is not None:
+            if isinstance(named, np.ndarray) and named.size == 1:  # the client sends a text, or an array with one text
+                named = named.item()
+            episode = shown(named, NAME_CHARACTERS)
+            if connection.episode not in (None, episode):
+                connection.end_episodes()
+            connection.episode = episode
+        return None
+
+    def answer(self, replies: Sequence[Reply], before_ms: float | None, *, batched: bool) -> Any:
+        return self.rows(replies[0]) if self.config.bare else super().answer(replies, before_ms, batched=batched)
+
+
 class MapConnection:
     """The state of one dialect on a connection, with its session."""
 
     def __init__(self, dialect: MapDialect) -> None:
         self.dialect = dialect
         self.sender: Sender = dialect.sender()
-        self.session: ImplicitSession = dialect.session(self.sender)
+        self.session: base.ImplicitSession = dialect.session(self.sender)
         self.episode: str | None = None  # name of the episode, set by the client
-        self._batched: list[ImplicitSession] = []  # sessions by index in a batch
+        self._batched: list[base.ImplicitSession] = []  # sessions by index in a batch
         self._before_ms: float | None = None
 
     def end_episodes(self) -> None:
@@ -180,15 +225,15 @@ class MapConnection:
         sessions = [self.session] if batch is None else await self._of_batch(len(batch))
         if not sessions[0].episode.begun:
             dialect.mapping.warn_of_unread_cameras(observations[0], dialect.name)
-        seen = [SessionObs(session, *one) for session, one in zip(sessions, read, strict=True)]
+        seen = [base.SessionObs(session, *one) for session, one in zip(sessions, read, strict=True)]
         incoming.decoded_alike(len(observations))
-        replies = await act_together(incoming, seen, request_id)
+        replies = await base.act_together(incoming, seen, request_id)
         before_ms, batched = self._before_ms, batch is not None
         data = incoming.written(lambda: openpi.encode(dialect.answer(replies, before_ms, batched=batched)))
         self._before_ms = (time.perf_counter() - incoming.arrived) * 1e3
         return data
 
-    async def _of_batch(self, number: int) -> list[ImplicitSession]:
+    async def _of_batch(self, number: int) -> list[base.ImplicitSession]:
         """Return the sessions of a batch of that size, in order; a change of the size ends the episodes."""
         if number != len(self._batched):
             surplus, self._batched = self._batched[number:], self._batched[:number]
@@ -201,61 +246,55 @@ class MapConnection:
         return self._batched
 
 
-class MapEndpoint:
-    """A path at which clients of these dialects connect; the last dialect sends the first message."""
+async def _stream(dialects: Sequence[MapDialect], socket: WebSocket) -> None:
+    """Serve one connection at a path of these dialects, of which the last one sends the first message."""
+    if not await base.accept_or_refuse(socket, dialects[0].context):
+        return
+    connections: dict[str, MapConnection] = {}
+    gate = dialects[0].gate()
+    try:
+        await socket.send_bytes(openpi.encode(dialects[-1].first()))
+        while (received := await dialects[0].receive(socket, gate)) is not None:
+            if not await _answer(dialects, socket, *received, connections, gate):
+                return
+    except WebSocketDisconnect:
+        return
+    finally:
+        for connection in connections.values():
+            connection.sender.release(for_good=True)
 
-    def __init__(self, dialects: Sequence[MapDialect]) -> None:
-        self._dialects = dialects
-        self._context = dialects[0].context
 
-    async def stream(self, socket: WebSocket) -> None:
-        """Serve one connection; its sessions end with it."""
-        if not await accept_or_refuse(socket, self._context):
-            return
-        connections: dict[str, MapConnection] = {}
-        gate = self._dialects[0].gate()
-        try:
-            await socket.send_bytes(openpi.encode(self._dialects[-1].first()))
-            while (received := await self._dialects[0].receive(socket, gate)) is not None:
-                if not await self._answer(socket, *received, connections, gate):
-                    return
-        except WebSocketDisconnect:
-            return
-        finally:
-            for connection in connections.values():
-                connection.sender.release(for_good=True)
-
-    async def _answer(
-        self,
-        socket: WebSocket,
-        data: bytes | None,
-        admission: MessageAdmission,
-        connections: dict[str, MapConnection],
-        gate: Sender,
-    ) -> bool:
-        """Reply to one message; return False if the connection was closed."""
-        incoming, request_id = self._dialects[0].arrived(), uuid.uuid4().hex
-        try:
-            message = await decoded(lambda data, budget: openpi.decode(data, budget.limits), data, admission)
-            dialect = next((dialect for dialect in self._dialects if dialect.speaks(message)), self._dialects[0])
-            arrived, incoming = incoming.arrived, dialect.arrived()
-            incoming.arrived = arrived
-            connection = connections.get(dialect.name) or connections.setdefault(dialect.name, MapConnection(dialect))
-            answer = await connection.answer(message, incoming, request_id, gate)
-        except Exception as error:  # noqa: BLE001 - the error is the reply to the client
-            problem = public_problem(error, incoming.transport, request_id)
-            incoming.record_failure(problem.code)
-            await socket.send_text(f"{problem} (request {request_id})")
-            if isinstance(problem, TooManyRequests):  # the connection stays open, as nothing was acted on
-                if gate.refused_too_often:
-                    await socket.close(POLICY_VIOLATION, REFUSED)
-                return not gate.refused_too_often
-            await socket.close(INTERNAL_ERROR, "Internal server error.")
-            return False
-        finally:
-            admission.release()
-        if isinstance(answer, str):
-            await socket.send_text(answer)
-        elif answer:
-            await socket.send_bytes(answer)
-        return True
+async def _answer(
+    dialects: Sequence[MapDialect],
+    socket: WebSocket,
+    data: bytes | None,
+    admission: MessageAdmission,
+    connections: dict[str, MapConnection],
+    gate: Sender,
+) -> bool:
+    """Reply to one message; return False if the connection was closed."""
+    incoming, request_id = dialects[0].arrived(), uuid.uuid4().hex
+    try:
+        message = await base.decoded(lambda data, budget: openpi.decode(data, budget.limits), data, admission)
+        dialect = next((dialect for dialect in dialects if dialect.speaks(message)), dialects[0])
+        arrived, incoming = incoming.arrived, dialect.arrived()
+        incoming.arrived = arrived
+        connection = connections.get(dialect.name) or connections.setdefault(dialect.name, MapConnection(dialect))
+        answer = await connection.answer(message, incoming, request_id, gate)
+    except Exception as error:  # noqa: BLE001 - the error is the reply to the client
+        problem = public_problem(error, incoming.transport, request_id)
+        incoming.record_failure(problem.code)
+        await socket.send_text(f"{problem} (request {request_id})")
+        if isinstance(problem, TooManyRequests):  # the connection stays open, as nothing was acted on
+            if gate.refused_too_often:
+                await socket.close(base.POLICY_VIOLATION, REFUSED)
+            return not gate.refused_too_often
+        await socket.close(base.INTERNAL_ERROR, "Internal server error.")
+        return False
+    finally:
+        admission.release()
+    if isinstance(answer, str):
+        await socket.send_text(answer)
+    elif answer:
+        await socket.send_bytes(answer)
+    return True

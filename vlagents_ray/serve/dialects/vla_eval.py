@@ -25,16 +25,8 @@ from vlagents_ray.chunking.buffer import ChunkBuffer
 from vlagents_ray.errors import MalformedMessage, MessageTooLarge, PolicyUnavailable, VLAgentsError, shown
 from vlagents_ray.protocol.messages import RankName
 from vlagents_ray.serve.config.dialects import DialectConfig, MappingSetting
-from vlagents_ray.serve.dialects.base import (
-    POLICY_VIOLATION,
-    ImplicitSession,
-    RouteDialect,
-    Stream,
-    accept_or_refuse,
-    decoded,
-    public_problem,
-)
-from vlagents_ray.serve.endpoints.http_messages import problem_response
+from vlagents_ray.serve.dialects import base
+from vlagents_ray.serve.endpoints.http_messages import problem_response, public_problem
 from vlagents_ray.serve.engine.admission import MessageAdmission
 from vlagents_ray.serve.engine.sender import REFUSED, Sender
 from vlagents_ray.wire import vla_eval
@@ -54,7 +46,7 @@ class VlaEvalDialectConfig(DialectConfig):
     )
 
 
-class VlaEvalDialect(RouteDialect):
+class VlaEvalDialect(base.RouteDialect):
     """vla-eval's protocol, in which the client states the begin and the end of each episode."""
 
     Config = VlaEvalDialectConfig
@@ -68,7 +60,7 @@ class VlaEvalDialect(RouteDialect):
     def routes(self) -> list[BaseRoute]:
         return [*super().routes(), Route("/health", self.health)]
 
-    def at_root(self, sharing: Sequence[VlaEvalDialect]) -> Stream:
+    def at_root(self, sharing: Sequence[VlaEvalDialect]) -> base.Stream:
         return self.stream
 
     async def health(self, _http: HttpRequest) -> Response:
@@ -81,7 +73,7 @@ class VlaEvalDialect(RouteDialect):
 
     async def stream(self, socket: WebSocket) -> None:
         """Serve one connection; its session ends with it."""
-        if not await accept_or_refuse(socket, self.context):
+        if not await base.accept_or_refuse(socket, self.context):
             return
         sender, gate = self.sender(), self.gate()
         session, chunk = self.session(sender), ChunkBuffer()  # the buffer holds unsent rows
@@ -89,11 +81,10 @@ class VlaEvalDialect(RouteDialect):
         reading = asyncio.ensure_future(inbox.fill(socket, gate, self))
         try:
             while (received := await inbox.next()) is not None:
-                answer = await self._answer(received, session, chunk)
-                if answer is not None:
+                if (answer := await self._answer(received, session, chunk)) is not None:
                     await socket.send_bytes(vla_eval.encode(answer))
             if inbox.end is not None:
-                await socket.close(POLICY_VIOLATION, inbox.end)
+                await socket.close(base.POLICY_VIOLATION, inbox.end)
         except WebSocketDisconnect:
             return
         finally:
@@ -103,7 +94,7 @@ class VlaEvalDialect(RouteDialect):
                 await reading
 
     async def _answer(
-        self, received: _Received, session: ImplicitSession, chunk: ChunkBuffer
+        self, received: _Received, session: base.ImplicitSession, chunk: ChunkBuffer
     ) -> vla_eval.Message | None:
         message = received.message
         if isinstance(message, VLAgentsError):
@@ -135,7 +126,7 @@ class VlaEvalDialect(RouteDialect):
         return vla_eval.Message("hello", payload, message.seq)
 
     async def _act(
-        self, message: vla_eval.Message, admission: MessageAdmission, session: ImplicitSession, chunk: ChunkBuffer
+        self, message: vla_eval.Message, admission: MessageAdmission, session: base.ImplicitSession, chunk: ChunkBuffer
     ) -> vla_eval.Message:
         incoming = self.arrived()
         request_id = uuid.uuid4().hex
@@ -205,7 +196,7 @@ class _Inbox:
     async def _read(data: bytes | None, admission: MessageAdmission) -> _Received:
         """Decode a message, which counts as a request of the key."""
         try:
-            message = await decoded(lambda data, budget: vla_eval.decode(data, budget.limits), data, admission)
+            message = await base.decoded(lambda data, budget: vla_eval.decode(data, budget.limits), data, admission)
             return _Received(message, admission)
         except Exception as error:  # noqa: BLE001 - the error is the reply to the client
             return _Received(public_problem(error, "vla_eval", "of an unreadable message"), admission)

@@ -14,7 +14,7 @@ import time
 from collections.abc import Mapping
 from typing import Any, ClassVar
 
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import BaseModel, Field, model_validator
 
 from vlagents_ray.contract import ActionSpec, Contract
 from vlagents_ray.errors import (
@@ -51,8 +51,7 @@ class VlagentsConnection:
 
     def __init__(self, dialect: VlagentsDialect, connection: socket.socket) -> None:
         self._context = context = dialect.context
-        self._dialect = dialect
-        self._connection = connection
+        self._dialect, self._connection = dialect, connection
         self._session = GatewaySessions(context.connect, context.contract)
         self._session.show(NoKey.OPEN, None)  # the protocol has no key, and the deployment accepted that
         self._segments = SharedMemory(same_machine=dialect.config.shared_memory and _is_same_machine(connection))
@@ -108,9 +107,6 @@ class VlagentsConnection:
         if call.handler is Handler.INSPECT:
             return tuple((name, None) for name in _METHODS)
         method, args = _called(call)
-        return self._method(method, args)
-
-    def _method(self, method: str, args: tuple[Any, ...]) -> Any:
         if method in ("act", "reset"):
             if len(args) != 1 or not isinstance(args[0], (str, bytes)):
                 raise MalformedMessage(f"{method}: want one argument, text")
@@ -151,8 +147,7 @@ class VlagentsConnection:
 
     def _ours(self, obs: Obs) -> Obs:
         """Return the observation under the policy's names, converted if the deployment has a mapping."""
-        mapping = self._dialect.stated_mapping
-        if mapping is None:
+        if (mapping := self._dialect.stated_mapping) is None:
             return obs
         theirs: dict[str, Any] = {"cameras": obs.cameras, "state": obs.state, "info": obs.info}
         if obs.gripper is not None:
@@ -168,8 +163,7 @@ class VlagentsConnection:
         if header is None:
             return None
         length, compressed = rpyc.read_header(header, self._context.limits.body_bytes)
-        body = self._read(length, _FRAME_S, time.monotonic() + _FRAME_S)
-        if body is None:
+        if (body := self._read(length, _FRAME_S, time.monotonic() + _FRAME_S)) is None:
             raise ConnectionResetError("the client disconnected within a message")
         return body, compressed
 
@@ -184,8 +178,7 @@ class VlagentsConnection:
             if left_s <= 0:
                 raise MessageTooLarge("a message took longer than a client may take")
             self._connection.settimeout(left_s)
-            more = self._connection.recv(min(length - len(data), 2**20))
-            if not more:
+            if not (more := self._connection.recv(min(length - len(data), 2**20))):
                 if data:
                     raise ConnectionResetError("the client disconnected within a message")
                 return None
@@ -289,11 +282,9 @@ class SharedMemory:
         self._open.clear()
 
     def _descriptor(self, name: str) -> int:
-        match = _NAME.fullmatch(name)
-        if match is None:
+        if (match := _NAME.fullmatch(name)) is None:
             raise InvalidObservation(f"shared memory: got the name {name[:40]!r}, want one like 'psm_01234567'")
-        known = self._open.get(match[1])
-        if known is not None:
+        if (known := self._open.get(match[1])) is not None:
             return known
         try:
             descriptor = os.open(f"{_FOLDER}/{match[1]}", os.O_RDONLY | os.O_NOFOLLOW | os.O_CLOEXEC | os.O_NONBLOCK)
@@ -308,10 +299,8 @@ class SharedMemory:
         return descriptor
 
 
-class GripperArgs(BaseModel):
+class GripperArgs(BaseModel, extra="forbid"):
     """The column of a robot's gripper in a row of the policy's actions, and its values."""
-
-    model_config = ConfigDict(extra="forbid")
 
     column: int = Field(default=-1, description="as in Python: -1 is the last")
     open: float | None = Field(default=None, description="its value for open; default: the policy's contract, or 1")
@@ -324,10 +313,8 @@ class GripperArgs(BaseModel):
         return self
 
 
-class RobotArgs(BaseModel):
+class RobotArgs(BaseModel, extra="forbid"):
     """The columns of one robot in a row."""
-
-    model_config = ConfigDict(extra="forbid")
 
     start: int | None = None
     stop: int | None = None

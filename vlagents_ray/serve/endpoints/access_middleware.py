@@ -53,12 +53,8 @@ class AccessMiddleware:
             idle_s: Maximum time that a WebSocket may be silent, s.
             hosts: Further host names of the server, see `require_own_page`.
         """
-        self._app = app
-        self._keys = keys
-        self._name = name
-        self._hosts = hosts
-        self._slow_s = slow_s
-        self._idle_s = idle_s
+        self._app, self._keys, self._name = app, keys, name
+        self._hosts, self._slow_s, self._idle_s = hosts, slow_s, idle_s
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Serve one connection as specified by ASGI."""
@@ -95,7 +91,7 @@ class AccessMiddleware:
                     if isinstance(caller, Caller):
                         caller.hold(-1)
             elif _has_body(scope):
-                await _TimedUpload(self._slow_s, send).run(self._app, scope, receive)
+                await _run_upload(self._app, scope, receive, send, self._slow_s)
             else:
                 await self._app(scope, receive, send)
 
@@ -127,60 +123,52 @@ async def _refuse(error: VLAgentsError, request_id: str, scope: Scope, receive: 
     await answer(scope, receive, send)
 
 
-class _TimedUpload:
-    """An HTTP request whose body must arrive within a time limit."""
+async def _run_upload(app: ASGIApp, scope: Scope, receive: Receive, send: Send, slow_s: float) -> None:
+    """Serve an HTTP request whose body must arrive within `slow_s`."""
+    task = asyncio.current_task()
+    late = answering = False
 
-    def __init__(self, slow_s: float, send: Send) -> None:
-        self._slow_s = slow_s
-        self._send = send
-        self._late = False
-        self._answering = False
+    def time_out() -> None:
+        nonlocal late
+        late = True
+        if task is not None:
+            task.cancel()
 
-    async def run(self, app: ASGIApp, scope: Scope, receive: Receive) -> None:
-        task = asyncio.current_task()
+    timer = asyncio.get_running_loop().call_later(slow_s, time_out)
 
-        def time_out() -> None:
-            self._late = True
-            if task is not None:
-                task.cancel()
-
-        timer = asyncio.get_running_loop().call_later(self._slow_s, time_out)
-
-        async def timed() -> Message:
-            _cancel_again(self._late)
-            message = await receive()
-            if message["type"] == "http.disconnect" or not message.get("more_body", False):
-                timer.cancel()
-            return message
-
-        async def answer(message: Message) -> None:
-            timer.cancel()  # the rest of the body is no longer awaited
-            self._answering = True
-            await self._send(message)
-
-        try:
-            await app(scope, timed, answer)
-        except asyncio.CancelledError:
-            if not self._late or self._answering:
-                raise
-            _uncancel(task)
-            late = MalformedMessage(f"body: not here within {self._slow_s:g} s; is the connection that slow?")
-            response = problem_response(late, uuid.uuid4().hex, _TIMEOUT)
-            response.headers["connection"] = "close"
-            await response(scope, receive, self._send)
-        finally:
+    async def timed() -> Message:
+        _cancel_again(late)
+        message = await receive()
+        if message["type"] == "http.disconnect" or not message.get("more_body", False):
             timer.cancel()
+        return message
+
+    async def answer(message: Message) -> None:
+        nonlocal answering
+        timer.cancel()  # the rest of the body is no longer awaited
+        answering = True
+        await send(message)
+
+    try:
+        await app(scope, timed, answer)
+    except asyncio.CancelledError:
+        if not late or answering:
+            raise
+        _uncancel(task)
+        error = MalformedMessage(f"body: not here within {slow_s:g} s; is the connection that slow?")
+        response = problem_response(error, uuid.uuid4().hex, _TIMEOUT)
+        response.headers["connection"] = "close"
+        await response(scope, receive, send)
+    finally:
+        timer.cancel()
 
 
 class _TimedWebSocket:
     """A WebSocket that ends when its key becomes invalid, or its client is silent or does not read replies."""
 
     def __init__(self, caller: Identity, slow_s: float, idle_s: float, receive: Receive, send: Send) -> None:
-        self._caller = caller
-        self._slow_s = slow_s
-        self._idle_s = idle_s
-        self._receive = receive
-        self._send = send
+        self._caller, self._slow_s, self._idle_s = caller, slow_s, idle_s
+        self._receive, self._send = receive, send
         self._loop = asyncio.get_running_loop()
         self._silent_since: float | None = None  # start of the wait for the next message, s; None if there is no wait
         self._sending_since: float | None = None  # start of the current sending, s; None if there is none

@@ -50,18 +50,27 @@ Control = Sequence[tuple[int, int, bytes]]
 Admit = Callable[[str | None], Caller]  # returns the caller with that key; raises `Unauthorized` or `Forbidden`
 
 
+class ReadBuffer(threading.local):
+    """Memory of `size` bytes for each thread to read into: new memory would cost as much as copying from here."""
+
+    def __init__(self, size: int) -> None:
+        self._view = memoryview(bytearray(size))
+
+    def receive(self, connection: socket.socket, size: int, space: int = STAMP_SPACE) -> tuple[memoryview, Control]:
+        """Read at most `size` bytes, and `space` bytes of control data, from a connection that is readable.
+
+        The bytes are valid until this thread reads again; there are none if the connection has ended.
+        """
+        count, control, _, _ = connection.recvmsg_into([self._view[:size]], space)
+        return self._view[:count], control
+
+
 class Acceptor:
     """Accepts connections; errors (an aborted connection, EMFILE) never stop the listener."""
 
     def __init__(self, listener: socket.socket, on_connection: Callable[[socket.socket], None]) -> None:
-        """Prepare to accept.
-
-        Args:
-            listener: The listening socket.
-            on_connection: Called with each connection, which is non-blocking; it must close those that it refuses.
-        """
-        self._listener = listener
-        self._on_connection = on_connection
+        """Prepare to accept; `on_connection` gets non-blocking connections, and must close those that it refuses."""
+        self._listener, self._on_connection = listener, on_connection
         # Without a free descriptor a client could not even be refused, and the listener would stay readable.
         self._spare = _descriptor()
 
@@ -203,9 +212,7 @@ class PolledConnection(ABC):
     def overdue(self, now: float, refusal: Callable[[Caller], str | None]) -> tuple[str, int] | None:
         """Return a reason and a close code if the connection has to end; called periodically, on any thread.
 
-        Args:
-            now: Time, s, of `time.monotonic`.
-            refusal: Returns the reason why a key is no longer valid, or None.
+        `now` is the time of `time.monotonic`, s; `refusal` returns the reason why a key is no longer valid, or None.
         """
         reason = refusal(self.caller) if isinstance(self.caller, Caller) else None
         return None if reason is None else (reason, POLICY_VIOLATION)

@@ -42,7 +42,10 @@ class FrontMiddleware:
             try:
                 name.decode(), value.decode()
             except UnicodeDecodeError:
-                await _refuse(MalformedMessage(f"header {shown(name)}: want UTF-8"), scope, receive, send)
+                if scope["type"] == "websocket":
+                    await receive()  # the "websocket.connect" message
+                refused = problem_response(MalformedMessage(f"header {shown(name)}: want UTF-8"), "")
+                await refused(scope, receive, send)
                 return
         if scope["type"] != "websocket":
             await self._app(scope, receive, send)
@@ -84,9 +87,3 @@ async def _discard(connection: socket.socket) -> None:
             if not count:
                 return
             left -= count
-
-
-async def _refuse(error: MalformedMessage, scope: Scope, receive: Receive, send: Send) -> None:
-    if scope["type"] == "websocket":
-        await receive()  # the "websocket.connect" message
-    await problem_response(error, "")(scope, receive, send)

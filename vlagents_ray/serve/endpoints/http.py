@@ -12,7 +12,6 @@ Errors over HTTP are problem+json with a stable code; over WebSocket they are re
 from __future__ import annotations
 
 import asyncio
-import logging
 import time
 import uuid
 from collections.abc import Awaitable, Callable, Sequence
@@ -29,36 +28,25 @@ from starlette.types import ASGIApp, Message, Receive, Scope, Send
 from starlette.websockets import WebSocket, WebSocketDisconnect
 
 from vlagents_ray.errors import MalformedMessage, PolicyUnavailable, UnknownApp, VLAgentsError
-from vlagents_ray.protocol.frames import CONTENT_TYPE, encode_replies
+from vlagents_ray.protocol import messages
+from vlagents_ray.protocol.frames import CONTENT_TYPE, decode_requests, encode_replies
 from vlagents_ray.protocol.json_messages import plain_values
-from vlagents_ray.protocol.messages import (
-    MACHINE_HEADER,
-    OPS,
-    RANK_HEADER,
-    STEP_HEADER,
-    Limits,
-    Op,
-    Reply,
-    is_probe,
-    probe_answer,
-    read_probe,
-)
 from vlagents_ray.serve.access.api_keys import current_caller
 from vlagents_ray.serve.endpoints.docs_page import STYLE, docs_page
 from vlagents_ray.serve.endpoints.http_messages import (
     RequestDecoder,
+    answer_error,
     deny,
     headers_of,
     html_response,
     problem_response,
+    public_problem,
     request_id,
     session_id,
 )
 from vlagents_ray.serve.engine.engine import Engine
 from vlagents_ray.serve.engine.sender import REFUSED, Sender
 from vlagents_ray.serve.requests import Message as Incoming
-
-logger = logging.getLogger(__name__)
 
 _POLICY_VIOLATION, _TRY_AGAIN_LATER = 1008, 1013  # WebSocket close codes
 _HEALTH_S = 1.5  # `/healthz` replies within this time
@@ -67,10 +55,9 @@ _HEALTH_S = 1.5  # `/healthz` replies within this time
 def build_http_app(
     engine: Engine,
     metadata: Callable[[], dict[str, Any]],
-    limits: Limits,
+    limits: messages.Limits,
     machine_metadata: Callable[[str], Awaitable[dict[str, Any]]] | None = None,
-    dialects: Sequence[BaseRoute] = (),
-    others: Sequence[BaseRoute] = (),
+    more: Sequence[BaseRoute] = (),
 ) -> Starlette:
     """Build the ASGI application of a replica.
 
@@ -80,22 +67,20 @@ def build_http_app(
     Args:
         metadata: Returns the document of `GET /v1/metadata`.
         machine_metadata: Returns the metadata for a caller on the machine with the given boot id.
-        dialects: The routes of other systems' clients, see `vlagents_ray.serve.dialects`.
-        others: The routes of learners and viewers, see `vlagents_ray.serve.endpoints.weights` and
-            `vlagents_ray.serve.observers.live_page`.
+        more: The routes of other systems' clients, learners and viewers, see `vlagents_ray.serve.dialects`,
+            `vlagents_ray.serve.endpoints.weights` and `vlagents_ray.serve.observers.live_page`.
     """
     server = _HttpEndpoint(engine, metadata, limits, machine_metadata)
     app = Starlette(
         routes=[
-            *(Route(f"/v1/{op}", server.endpoint(op), methods=["POST"]) for op in OPS),
+            *(Route(f"/v1/{op}", server.endpoint(op), methods=["POST"]) for op in messages.OPS),
             WebSocketRoute("/v1/stream", server.stream),
             Route("/v1/metadata", server.show_metadata),
             Route("/healthz", server.health),
             Route("/docs", server.docs),
-            *dialects,
-            *others,
+            *more,
         ],
-        exception_handlers={HTTPException: _http_problem},
+        exception_handlers={HTTPException: _http_problem, VLAgentsError: answer_error},
     )
     app.router.redirect_slashes = False  # many clients drop the body of a redirected POST
     app.router.default = partial(_no_such_path, app.router.default)
@@ -107,12 +92,10 @@ class _HttpEndpoint:
         self,
         engine: Engine,
         metadata: Callable[[], dict[str, Any]],
-        limits: Limits,
+        limits: messages.Limits,
         machine_metadata: Callable[[str], Awaitable[dict[str, Any]]] | None,
     ) -> None:
-        self._engine = engine
-        self._metadata = metadata
-        self._limits = limits
+        self._engine, self._metadata, self._limits = engine, metadata, limits
         self._requests = RequestDecoder(limits)
         self._machine_metadata = machine_metadata
 
@@ -130,7 +113,7 @@ class _HttpEndpoint:
         return problem_response(unready, request_id(http))
 
     async def show_metadata(self, http: HttpRequest) -> Response:
-        machine = http.headers.get(MACHINE_HEADER)
+        machine = http.headers.get(messages.MACHINE_HEADER)
         if machine and self._machine_metadata is not None and self._engine.ready:
             return JSONResponse(plain_values(await self._machine_metadata(machine)))
         return self._when_ready(http, lambda: JSONResponse(plain_values(self._metadata())))
@@ -145,7 +128,7 @@ class _HttpEndpoint:
             return problem_response(error, request_id(http), 503)
         return answer()
 
-    def endpoint(self, op: Op) -> Callable[[HttpRequest], Awaitable[Response]]:
+    def endpoint(self, op: messages.Op) -> Callable[[HttpRequest], Awaitable[Response]]:
         """Return the handler of `POST /v1/<op>`."""
 
         async def handle(http: HttpRequest) -> Response:
@@ -153,7 +136,7 @@ class _HttpEndpoint:
             name, headers = request_id(http), headers_of(http.scope)
             try:
                 sender = Sender(self._engine, "http", session_id(http), caller=current_caller(), connected=False)
-                admission = sender.admission(self._limits, rank=headers.get(RANK_HEADER, "robot"))
+                admission = sender.admission(self._limits, rank=headers.get(messages.RANK_HEADER, "robot"))
                 decoded = await self._requests.read(op, _timed(http, incoming), admission, name)
                 incoming.decoded(decoded)
                 if decoded.requests:
@@ -163,17 +146,15 @@ class _HttpEndpoint:
                     raise error
                 if CONTENT_TYPE in headers.get("accept", "") or len(replies) > 1:
                     return Response(incoming.frame(), media_type=CONTENT_TYPE)
-                step = {} if replies[0].step is None else {STEP_HEADER: str(replies[0].step)}
+                step = {} if replies[0].step is None else {messages.STEP_HEADER: str(replies[0].step)}
                 return Response(incoming.document(), headers=step, media_type="application/json")
             except ClientDisconnect:
                 incoming.record_failure("disconnected")
                 return Response(status_code=499)
-            except Exception as error:
-                if not isinstance(error, VLAgentsError):
-                    logger.exception("%s failed (request %s)", op, name)
-                    error = VLAgentsError("internal error; the server's log has the details")
-                incoming.record_failure(error.code)
-                return problem_response(error, name)
+            except Exception as error:  # noqa: BLE001 - the error is the reply to the client
+                problem = public_problem(error, op, name)
+                incoming.record_failure(problem.code)
+                return problem_response(problem, name)
 
         return handle
 
@@ -182,7 +163,7 @@ class _HttpEndpoint:
         await socket.accept()
         if len(self._engine.sessions) >= self._engine.sessions.limit:
             full = self._engine.sessions.full()
-            await socket.send_bytes(encode_replies([Reply(error=full)]))
+            await socket.send_bytes(encode_replies([messages.Reply(error=full)]))
             await socket.close(_TRY_AGAIN_LATER, str(full)[:120])
             return
         sender = Sender(self._engine, "websocket", caller=current_caller())
@@ -192,43 +173,34 @@ class _HttpEndpoint:
                 message = await socket.receive()
                 if message["type"] == "websocket.disconnect":
                     return
-                await self._reply(socket, sender, message.get("bytes"))
+                await socket.send_bytes(await self._answer(sender, message.get("bytes")))
             await socket.close(_POLICY_VIOLATION, REFUSED)
         except WebSocketDisconnect:
             return
         finally:
             sender.release()
 
-    async def _reply(self, socket: WebSocket, sender: Sender, message: bytes | None) -> None:
-        if message is not None and is_probe(message):
-            await socket.send_bytes(self._probed(sender, message))
-            return
+    async def _answer(self, sender: Sender, frame: bytes | None) -> bytes:
+        """Return the answer to a message of a WebSocket, a frame or a probe; None is a text message."""
+        if frame is not None and messages.is_probe(frame):
+            try:
+                messages.read_probe(frame, sender.admission(self._limits, len(frame), "simulation"))
+                return messages.probe_answer(len(frame))
+            except VLAgentsError as error:
+                return encode_replies([messages.Reply(error=error)])
         incoming = sender.message()
-        await self._answer(sender, message, incoming)
-        await socket.send_bytes(incoming.frame())
-
-    def _probed(self, sender: Sender, message: bytes) -> bytes:
-        try:
-            read_probe(message, sender.admission(self._limits, len(message), "simulation"))
-            return probe_answer(len(message))
-        except VLAgentsError as error:
-            return encode_replies([Reply(error=error)])
-
-    async def _answer(self, sender: Sender, frame: bytes | None, incoming: Incoming) -> None:
         admission = sender.admission(self._limits, 0 if frame is None else len(frame))
         try:
             admission.begin_message()
             if frame is None:
                 raise MalformedMessage("stream: got a text message, want a binary frame")
-            decoded = await self._requests.decode(frame, admission)
+            decoded = await admission.decoded(partial(decode_requests, frame))
             incoming.decoded(decoded)
             await sender.ask(incoming, decoded, admission)
-        except VLAgentsError as error:
-            incoming.refuse(error)
-        except Exception:
-            name = uuid.uuid4().hex
-            logger.exception("stream failed (request %s)", name)
-            incoming.refuse(VLAgentsError("internal error; the server's log has the details"), name)
+        except Exception as error:  # noqa: BLE001 - the error is the reply to the client
+            name = "" if isinstance(error, VLAgentsError) else uuid.uuid4().hex
+            incoming.refuse(public_problem(error, "stream", name), name)
+        return incoming.frame()
 
 
 def _timed(http: HttpRequest, incoming: Incoming) -> HttpRequest:

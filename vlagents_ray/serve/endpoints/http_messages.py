@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import base64
 import hashlib
+import logging
 import math
 import uuid
 from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
-from typing import Any
+from typing import Any, cast
 
 from starlette.exceptions import HTTPException
 from starlette.formparsers import MultiPartException
@@ -42,6 +43,8 @@ from vlagents_ray.protocol.messages import (
 )
 from vlagents_ray.serve.engine.admission import MessageAdmission
 
+logger = logging.getLogger(__name__)
+
 LONG_BYTES = 512 * 1024  # longer JSON or msgpack is decoded on another thread, to keep the event loop responsive
 _POLICY_VIOLATION = 1008  # WebSocket close code
 _GZIP = b"\x1f\x8b"  # the first bytes of a gzip file
@@ -49,7 +52,7 @@ _HEADERS = "vlagents_ray.headers"  # key of the decoded headers in an ASGI scope
 
 
 class _Refused(MultiPartException):
-    """Raised to stop the parsing of a form, so that the parser closes its files."""
+    """Raised to stop the reading of a body; the parser of a form then closes its files."""
 
     def __init__(self, error: VLAgentsError) -> None:
         super().__init__(str(error))
@@ -76,7 +79,7 @@ class RequestDecoder:
         else:
             body = await self.body(http, admission)
             if kind == CONTENT_TYPE:
-                return self._checked(op, await self.decode(body, admission), http, name)
+                return self._checked(op, await admission.decoded(partial(decode_requests, body)), http, name)
             if kind == "application/json":
                 request = await admission.decoded(
                     partial(request_from_parts, op, body, {}), long=len(body) > LONG_BYTES
@@ -157,7 +160,8 @@ class RequestDecoder:
             try:
                 if size > self._limits.body_bytes:
                     raise MessageTooLarge(f"body: over {self._limits.body_bytes} bytes, the limit")
-                admission.receive(length)
+                if length:
+                    admission.receive(length)
             except VLAgentsError as error:
                 raise _Refused(error) from error
             return message
@@ -173,21 +177,13 @@ class RequestDecoder:
             Overloaded: The replica has no room for the body among its messages in flight.
         """
         _require_uncompressed(http)
-        chunks: list[bytes] = []
-        size = 0
-        async for chunk in http.stream():
-            size += len(chunk)
-            if size > self._limits.body_bytes:
-                raise MessageTooLarge(f"body: over {self._limits.body_bytes} bytes, the limit")
-            admission.receive(len(chunk))
-            chunks.append(chunk)
-        if chunks and chunks[0].startswith(_GZIP):
+        try:
+            body = await HttpRequest(http.scope, self._limited(http, admission)).body()
+        except _Refused as refused:
+            raise refused.error from None
+        if body.startswith(_GZIP):
             raise MalformedMessage("body: got gzip, want it uncompressed; send it as it is")
-        return b"".join(chunks)
-
-    async def decode(self, frame: bytes, admission: MessageAdmission) -> Decoded:
-        """Decode the requests of a frame."""
-        return await admission.decoded(partial(decode_requests, frame))
+        return body
 
 
 def _wrong_part(name: str) -> str:
@@ -256,6 +252,11 @@ def named(shown: str) -> str:
     return shown if shown and is_name(shown) else uuid.uuid4().hex
 
 
+async def answer_error(http: HttpRequest, error: Exception) -> Response:
+    """Answer a request whose handler has raised an error of this package."""
+    return problem_response(cast(VLAgentsError, error), request_id(http))
+
+
 async def deny(socket: WebSocket, error: VLAgentsError) -> None:
     """Refuse a WebSocket before it is accepted, with the error as an HTTP response if the server supports that."""
     if "websocket.http.response" in (socket.scope.get("extensions") or {}):
@@ -289,6 +290,14 @@ def html_response(html: str, *, styles: Sequence[str] = (), scripts: Sequence[st
 
 def _digest(text: str) -> str:
     return f"'sha256-{base64.b64encode(hashlib.sha256(text.encode()).digest()).decode()}'"
+
+
+def public_problem(error: Exception, what: str, request_id: str) -> VLAgentsError:
+    """Return the error that a client may see; details of an unexpected error are only logged."""
+    if isinstance(error, VLAgentsError):
+        return error
+    logger.error("%s failed (request %s)", what, request_id, exc_info=error)
+    return VLAgentsError("internal error; the server's log has the details")
 
 
 def problem_response(error: VLAgentsError, request_id: str, status: int | None = None) -> Response:

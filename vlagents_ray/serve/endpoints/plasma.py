@@ -31,15 +31,7 @@ from ray.exceptions import RayChannelError, RayChannelTimeoutError
 
 from vlagents_ray.errors import MalformedMessage, MessageTooLarge
 from vlagents_ray.protocol.messages import Limits, LocalAddress, PlasmaAddress
-from vlagents_ray.ray_tools.private import (
-    channel_pieces,
-    create_channel,
-    plain_content,
-    plasma_folder,
-    read_channel,
-    register_writer,
-    write_channel,
-)
+from vlagents_ray.ray_tools import private
 from vlagents_ray.serve.access.api_keys import NoKey
 from vlagents_ray.serve.endpoints.connection import BACKLOG
 from vlagents_ray.serve.endpoints.shm import UnixServer
@@ -66,15 +58,15 @@ class Channel:
         found = self._take()
         if found.metadata != PlasmaAddress.TAG:  # Ray's parser below trusts its input, as everywhere
             raise MalformedMessage("plasma: what the channel holds is no frame; is this a client of vlagents_ray?")
-        return b"".join(channel_pieces(found.data))
+        return b"".join(private.channel_pieces(found.data))
 
     def intact(self) -> bool:
         """Discard an unread frame; return False if the writer was killed during a write, which locks the channel."""
         with contextlib.suppress(MalformedMessage):
             self._take()
         try:
-            register_writer(self.ref)
-            if write_channel(self.ref, plain_content(b"x"), 0) is not None:
+            private.register_writer(self.ref)
+            if private.write_channel(self.ref, private.plain_content(b"x"), 0) is not None:
                 return False
             self._take()
         except (RayChannelError, MalformedMessage):
@@ -84,7 +76,7 @@ class Channel:
     def _take(self) -> Any:
         """Return the latest frame in place; it is valid while the caller holds it."""
         try:
-            return read_channel(self.ref)
+            return private.read_channel(self.ref)
         except RayChannelTimeoutError as error:
             raise MalformedMessage("plasma: a message came without a frame in its channel") from error
 
@@ -100,10 +92,7 @@ class Pool:
         self._bytes = 0
 
     def lease(self, length: int) -> tuple[bytes, int]:
-        """Lease a channel to a client; this takes milliseconds.
-
-        Args:
-            length: Size of the frames, bytes.
+        """Lease a channel for frames of `length` bytes to a client; this takes milliseconds.
 
         Returns:
             The id of the channel and the maximum size of its frames, bytes.
@@ -142,11 +131,6 @@ class Pool:
         with self._lock:
             self._return_channel(channel)
 
-    def counts(self) -> tuple[int, int]:
-        """Return the number of free channels and the size of all channels, bytes."""
-        with self._lock:
-            return len(self._free), self._bytes
-
     def _return_channel(self, channel: Channel) -> None:
         if channel.intact():
             self._free.append(channel)
@@ -169,7 +153,7 @@ class Pool:
                 )
             self._bytes += capacity
         try:
-            ref = create_channel(capacity + _HEADER)
+            ref = private.create_channel(capacity + _HEADER)
         except BaseException:
             with self._lock:
                 self._bytes -= capacity
@@ -186,12 +170,12 @@ class PlasmaServer(UnixServer):
         """Prepare the pool and the socket; `limits` are the limits of a frame."""
         self.pool = Pool(limits)
         super().__init__(engine, NoKey.INSIDE, limits, partial(LeasedChannel, self.pool))  # the cluster needs no key
-        folder = plasma_folder()
+        folder = private.plasma_folder()
         # The name is no longer than that of the store's socket in the same folder, since socket paths are limited.
         self._path = folder / f"vla{secrets.token_hex(4)}"
         self.plasma = PlasmaAddress(str(self._path), ray.get_runtime_context().get_node_id())
 
-    def listen(self) -> None:
+    def open(self) -> None:
         """Listen, then give the socket its name; remove the sockets of killed replicas."""
         for other in self._path.parent.glob("vla????????"):
             _remove_if_dead(other)
@@ -200,6 +184,7 @@ class PlasmaServer(UnixServer):
         hidden.chmod(0o600)
         self._listener.listen(BACKLOG)
         hidden.rename(self._path)
+        super().open()
 
     def close(self) -> None:
         """Close the listener and all connections, and remove the socket; call this after the engine has ended."""

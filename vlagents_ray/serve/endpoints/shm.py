@@ -17,10 +17,8 @@ import secrets
 import select
 import socket
 import struct
-import threading
 import time
 import weakref
-from abc import abstractmethod
 from array import array
 from collections.abc import Callable, Sequence
 from functools import partial
@@ -41,6 +39,7 @@ from vlagents_ray.serve.endpoints.connection import (
     Admit,
     PolledConnection,
     PolledServer,
+    ReadBuffer,
     enable_timestamps,
     has_unread,
     time_in_socket_s,
@@ -58,6 +57,8 @@ _INLINE = 64 * 1024  # a longer reply is sent in a memory file
 _KEY_S = 5.0  # time within which a client must send its key
 _KEY_BYTES = 4096  # maximum size of a key
 _MAX_VIEWS = 8  # number of memory files with views held by the policy above which requests are copied
+
+_read_buffer = ReadBuffer(_MESSAGE_BYTES)  # each message is processed before the next one is read
 
 
 class Payload(Protocol):
@@ -90,17 +91,7 @@ class UnixServer(PolledServer["UnixConnection"]):
         """Create the server; `payload` creates the payload of a connection, and `ops` are the accepted operations."""
         listener = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET | socket.SOCK_NONBLOCK)
         super().__init__(engine, limits, admit, listener)
-        self.payload = payload
-        self.ops = ops
-
-    @abstractmethod
-    def listen(self) -> None:
-        """Bind the socket to its name and listen."""
-
-    def open(self) -> None:
-        """Start to listen; call this before the engine starts."""
-        self.listen()
-        super().open()
+        self.payload, self.ops = payload, ops
 
     def _add_client(self, connection: socket.socket) -> None:
         if peer_uid(connection) != os.getuid():
@@ -135,27 +126,26 @@ class UnixConnection(PolledConnection):
         if self._sender is not None and self._sender.rated and self._is_throttled():
             return
         message = Message(self._engine.stats, self._name)
-        buffer = _buffers.bytes
         try:
-            size, control, _, _ = self._connection.recvmsg_into([buffer], _CONTROL)
+            data, control = _read_buffer.receive(self._connection, _MESSAGE_BYTES, _CONTROL)
         except BlockingIOError:
             return
         except OSError as error:
             logger.info("local client: %s", error)
-            size, control = 0, []
+            data, control = memoryview(b""), []
         descriptors = [
             number
-            for _, kind, data in control
+            for _, kind, packed in control
             if kind == socket.SCM_RIGHTS
-            for number in array("i", data[: len(data) // 4 * 4])
+            for number in array("i", packed[: len(packed) // 4 * 4])
         ]
         try:
-            if not size:
+            if not data:
                 self.disconnect()
                 return
-            sender = self._sender or self._authenticate(bytes(buffer[: min(size, _KEY_BYTES)]))
+            sender = self._sender or self._authenticate(bytes(data[:_KEY_BYTES]))
             if sender is not None:
-                self._receive(sender, message, time_in_socket_s(control), memoryview(buffer)[:size], descriptors)
+                self._receive(sender, message, time_in_socket_s(control), data, descriptors)
         except VLAgentsError as error:
             message.refuse(error)
             self._write(message)
@@ -260,10 +250,11 @@ class ShmServer(UnixServer):
             f"vlagents-ray-{secrets.token_hex(16)}", boot_id(), keyed=not isinstance(admit, NoKey)
         )
 
-    def listen(self) -> None:
-        """Listen at the address in the metadata."""
+    def open(self) -> None:
+        """Listen at the address in the metadata; call this before the engine starts."""
         self._listener.bind(f"\0{self.address.socket}")
         self._listener.listen(BACKLOG)
+        super().open()
 
 
 class MemoryFiles:
@@ -342,13 +333,3 @@ def _has_hung_up(connection: socket.socket) -> bool:
     poller = select.poll()
     poller.register(connection, 0)  # reports a hang-up in any case
     return bool(poller.poll(0))
-
-
-class _Buffers(threading.local):
-    """One buffer per thread for the message that is being read, which is processed before the next one is read."""
-
-    def __init__(self) -> None:
-        self.bytes = bytearray(_MESSAGE_BYTES)
-
-
-_buffers = _Buffers()

@@ -1,5 +1,7 @@
 """The WebSocket port of a replica, without a proxy between the robot and the policy thread.
 
+Large messages are not copied, and a client that reads slowly delays no other client.
+
 The metadata contains the port and an unguessable path, so that only clients that may read the metadata can use the
 port; with API keys, the handshake must also contain one. Messages are those of `WS /v1/stream` on the server's port,
 which remains for clients that cannot reach this one. As for local clients, the policy thread reads the sockets (see
@@ -8,20 +10,24 @@ which remains for clients that cannot reach this one. As for local clients, the 
 
 from __future__ import annotations
 
+import contextlib
 import logging
 import secrets
+import select
 import socket
+import threading
 import time
 from collections import deque
-from collections.abc import Callable, Collection
+from collections.abc import Callable, Collection, Generator
 from functools import partial
 from typing import ClassVar
 
 from websockets.frames import Frame, Opcode
 from websockets.http11 import Request as Handshake
 from websockets.http11 import Response
-from websockets.protocol import State
+from websockets.protocol import Protocol, State
 from websockets.server import ServerProtocol
+from websockets.streams import StreamReader
 
 from vlagents_ray.errors import (
     ConfigError,
@@ -32,19 +38,10 @@ from vlagents_ray.errors import (
     UnknownApp,
     VLAgentsError,
 )
+from vlagents_ray.protocol import messages
 from vlagents_ray.protocol.frames import Decoded, decode_requests
-from vlagents_ray.protocol.messages import (
-    STREAM_BYTES,
-    STREAM_PATH,
-    Limits,
-    StreamAddress,
-    is_probe,
-    probe_answer,
-    read_probe,
-)
 from vlagents_ray.serve.access.api_keys import Caller, Identity, NoKey, token_of
 from vlagents_ray.serve.access.origin_check import require_own_page
-from vlagents_ray.serve.endpoints.buffers import READ_BYTES, ReceiveBuffer, SendBuffer, receive
 from vlagents_ray.serve.endpoints.connection import (
     BACKLOG,
     DECODING,
@@ -54,6 +51,7 @@ from vlagents_ray.serve.endpoints.connection import (
     Admit,
     PolledConnection,
     PolledServer,
+    ReadBuffer,
     enable_timestamps,
     has_unread,
     time_in_socket_s,
@@ -65,6 +63,9 @@ from vlagents_ray.serve.requests import Message
 
 logger = logging.getLogger(__name__)
 
+_READ_BYTES = 1024 * 1024  # room for a message with two or three raw images
+_SMALL_BYTES = 1024  # parts of a frame up to this size are copied, since a view of them may outlast the buffer
+_SLOW_S = 10.0  # maximum time without progress for a client that does not read all replies at once
 _MAX_HANDSHAKES = 64  # maximum number of connections without a completed handshake
 _HANDSHAKE_BYTES = 16 * 1024  # maximum size of a handshake
 _HANDSHAKE_S = 5.0  # maximum time of a handshake
@@ -78,6 +79,8 @@ _BACKLOGGED, _REFUSED = "too much of it is unanswered", "its handshake is refuse
 # The kernel detects that a peer has disappeared: after 20 s of silence it sends three probes, 5 s apart.
 _KEEPALIVE = (("TCP_KEEPIDLE", 20), ("TCP_KEEPINTVL", 5), ("TCP_KEEPCNT", 3), ("TCP_USER_TIMEOUT", 35_000))
 
+read_buffer = ReadBuffer(_READ_BYTES)
+
 
 class WebSocketServer(PolledServer["WebSocketConnection"]):
     """Accepts WebSockets at a port of the replica."""
@@ -87,7 +90,7 @@ class WebSocketServer(PolledServer["WebSocketConnection"]):
     def __init__(
         self,
         engine: Engine,
-        limits: Limits,
+        limits: messages.Limits,
         host: str,
         ports: tuple[int, int] | None,
         admit: Admit | NoKey,
@@ -111,9 +114,9 @@ class WebSocketServer(PolledServer["WebSocketConnection"]):
         super().__init__(engine, limits, admit, _bind(host, ports))
         self.slow_s, self.idle_s = slow_s, idle_s
         self._hosts = hosts
-        self.path = STREAM_PATH + secrets.token_urlsafe(24)
+        self.path = messages.STREAM_PATH + secrets.token_urlsafe(24)
         self._handshaking: dict[WebSocketConnection, None] = {}  # before their handshake, in order of arrival
-        self.address = StreamAddress(self._listener.getsockname()[1], self.path)
+        self.address = messages.StreamAddress(self._listener.getsockname()[1], self.path)
 
     def open(self) -> None:
         """Accept clients; call this before the engine starts."""
@@ -174,11 +177,11 @@ class WebSocketConnection(PolledConnection):
         super().__init__(server, connection)
         self._server, self._limits = server, server.limits
         self._arrived = 0.0  # arrival time of the bytes read last, s
-        self._protocol = ServerProtocol(max_size=STREAM_BYTES)  # guarded by the lock
+        self._protocol = ServerProtocol(max_size=messages.STREAM_BYTES)  # guarded by the lock
         self._head = b""  # received part of the handshake
         self._refused_for_s = 0.0  # time after which the handshake is no longer over the rate of its key
         self._received = ReceiveBuffer()
-        self._out = SendBuffer(connection, self._sending, STREAM_BYTES)
+        self._out = SendBuffer(connection, self._sending, messages.STREAM_BYTES)
         self._paused = False  # whether too many messages are unanswered; guarded by the lock
         # Received but unprocessed frames, their arrival times, s, and the admissions of those received in parts.
         self._frames: deque[tuple[Frame, float, MessageAdmission | None]] = deque()
@@ -194,8 +197,10 @@ class WebSocketConnection(PolledConnection):
     def _read(self) -> None:
         if self._sender is not None and self._sender.rated and self._is_throttled():
             return
+        data: bytes | memoryview
+        size = _HANDSHAKE_BYTES if self._sender is None else _READ_BYTES
         try:
-            data, control = receive(self._connection, _HANDSHAKE_BYTES if self._sender is None else READ_BYTES)
+            data, control = read_buffer.receive(self._connection, size)
             self._arrived = time.perf_counter() - time_in_socket_s(control)
         except BlockingIOError:
             return
@@ -381,9 +386,9 @@ class WebSocketConnection(PolledConnection):
             if frame.opcode is Opcode.TEXT:
                 raise MalformedMessage("stream: got a text message, want a binary frame")
             data = bytes(frame.data)
-            if is_probe(data):
-                read_probe(data, admission)
-                self._send(probe_answer(len(data)))
+            if messages.is_probe(data):
+                messages.read_probe(data, admission)
+                self._send(messages.probe_answer(len(data)))
             else:
                 submit = partial(self._submit, sender, message, admission, len(data), arrived)
                 self._decode(message, partial(decode_requests, data), admission, submit)
@@ -436,6 +441,141 @@ class WebSocketConnection(PolledConnection):
         """Send the bytes that the protocol has produced; the caller holds the lock."""
         pieces = self._protocol.data_to_send()
         self._out.send(b"".join(pieces), last=b"" in pieces)
+
+
+class ReceiveBuffer(StreamReader):
+    """The bytes of WebSocket frames that one connection has received, until they are parsed.
+
+    A message that arrives as a whole is parsed where it was read, and only copied when its mask is removed. The reader
+    of `websockets` copies each message three times.
+    """
+
+    buffer: bytes | bytearray | memoryview  # type: ignore[assignment]
+
+    def __init__(self) -> None:
+        super().__init__()
+        self._start = 0  # start of the unparsed bytes in `buffer`
+
+    @property
+    def size(self) -> int:
+        """Number of unparsed bytes; on other threads than that of `parse`, only whether it is 0 is reliable."""
+        return len(self.buffer) - self._start
+
+    def attach(self, protocol: Protocol) -> None:
+        """Become the reader of a protocol that has parsed all its bytes so far."""
+        protocol.reader = self
+        protocol.parser = Protocol.parse(protocol)  # the old parser reads from the old reader
+        next(protocol.parser)
+        self._protocol = protocol
+
+    def parse(self, data: bytes | memoryview) -> None:
+        """Parse bytes of `read_buffer`, and copy the rest after the last complete frame."""
+        self._protocol.receive_data(data)  # type: ignore[arg-type]
+        if isinstance(self.buffer, bytearray):
+            del self.buffer[: self._start]
+        else:
+            self.buffer = bytearray(self.buffer[self._start :])
+        self._start = 0
+
+    def feed_data(self, data: bytes | bytearray) -> None:
+        """Add bytes, as the protocol's parser requires; raise `EOFError` after `feed_eof`."""
+        if self.eof:
+            raise EOFError("stream ended")
+        if self.size:
+            self.buffer += data  # type: ignore[operator]
+        else:
+            self.buffer, self._start = data, 0
+
+    def read_exact(self, n: int) -> Generator[None, None, bytearray]:
+        """Return the next `n` bytes once they have arrived; many bytes that were just received are a view."""
+        while self.size < n:
+            if self.eof:
+                raise EOFError(f"stream ends after {self.size} bytes, expected {n} bytes")
+            yield
+        begin, self._start = self._start, self._start + n
+        found = self.buffer[begin : self._start]
+        return found if n > _SMALL_BYTES else bytearray(found)  # type: ignore[return-value]
+
+    def at_eof(self) -> Generator[None, None, bool]:
+        """Return whether the connection has ended, as soon as that is known; unparsed bytes mean that it has not."""
+        while not self.size:
+            if self.eof:
+                return True
+            yield
+        return False
+
+    def discard(self) -> None:
+        """Drop the unparsed bytes."""
+        self.buffer, self._start = bytearray(), 0
+
+
+class SendBuffer:
+    """The unsent bytes of one connection.
+
+    Call the methods with the connection's lock held; the thread that sends to a slow client acquires the same lock.
+    """
+
+    def __init__(self, connection: socket.socket, lock: threading.Lock, limit: int) -> None:
+        """Create an empty buffer; a client is cut off if more than `limit` bytes wait, or it reads none for 10 s."""
+        self._connection, self._lock, self._limit = connection, lock, limit
+        self._unsent = bytearray()
+        self._slow = False  # whether a thread is sending the rest
+        self._closed = self._last = False
+
+    def send(self, data: bytes, *, last: bool = False) -> None:
+        """Send as many bytes as the connection accepts now; a thread sends the rest later.
+
+        After the `last` bytes the client reads the end of the connection, which stays open for reading.
+        """
+        if self._closed:
+            return
+        self._last = self._last or last
+        self._unsent += data
+        if not self._slow:
+            self._send_now()
+            if self._unsent:
+                self._slow = True
+                threading.Thread(target=self._send_rest, name="send-slowly", daemon=True).start()
+        elif len(self._unsent) > self._limit:
+            self._disconnect()
+
+    def close(self) -> None:
+        """Stop sending; call this before the connection is closed."""
+        self._closed = True
+
+    def _send_now(self) -> None:
+        try:
+            sent = self._connection.send(self._unsent) if self._unsent else 0
+        except BlockingIOError:
+            return
+        except OSError as error:  # the client is gone; the reading thread handles the end of the connection
+            logger.info("client: %s", error)
+            sent = len(self._unsent)
+        del self._unsent[:sent]
+        if self._last and not self._unsent:
+            with contextlib.suppress(OSError):
+                self._connection.shutdown(socket.SHUT_WR)
+
+    def _send_rest(self) -> None:
+        poller = select.poll()
+        poller.register(self._connection, select.POLLOUT)
+        while True:
+            writable = poller.poll(_SLOW_S * 1e3)
+            with self._lock:
+                if self._closed:
+                    return
+                if not writable:
+                    self._disconnect()
+                self._send_now()
+                if not self._unsent:
+                    self._slow = False
+                    return
+
+    def _disconnect(self) -> None:
+        logger.warning("client: takes no replies; cut off")
+        self._unsent.clear()
+        with contextlib.suppress(OSError):  # the client closed it already
+            self._connection.shutdown(socket.SHUT_RDWR)
 
 
 def _bind(host: str, ports: tuple[int, int] | None) -> socket.socket:

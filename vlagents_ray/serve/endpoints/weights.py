@@ -32,7 +32,7 @@ from starlette.websockets import WebSocket, WebSocketDisconnect
 from vlagents_ray.errors import InvalidInput, MalformedMessage, MessageTooLarge, Overloaded, VLAgentsError, shown
 from vlagents_ray.protocol.json_messages import problem
 from vlagents_ray.serve.access.api_keys import Caller, ScopeCheck, current_caller
-from vlagents_ray.serve.endpoints.http_messages import deny, problem_response, request_id
+from vlagents_ray.serve.endpoints.http_messages import deny
 from vlagents_ray.serve.weights import PushOptions, PushResult, Rest
 from vlagents_ray.weights.safetensors import MESSAGE_BYTES, ValueSpec, ValuesReader
 
@@ -50,28 +50,21 @@ class ReceivesWeights(Protocol):
 
     def read_header(self, header: bytes, options: PushOptions) -> dict[str, ValueSpec]:
         """Return the types and shapes of the announced values; raise an error if they do not fit the policy."""
-        ...
 
     async def push_received(self, named: Mapping[str, Any], options: PushOptions) -> PushResult:
         """Make all replicas act with new weights."""
-        ...
 
     async def rest(self, rest: Rest) -> None:
         """Let all replicas take a step of a rest."""
-        ...
 
     async def versions_of_weights(self) -> list[int]:
         """Return the newest version of each replica."""
-        ...
 
 
 def weights_routes(replicas: ReceivesWeights, slow_s: float, *, open_to_network: bool) -> list[BaseRoute]:
-    """Return the routes for new weights.
+    """Return the routes for new weights, each part of which must arrive within `slow_s`, s.
 
-    Args:
-        replicas: The replicas that get the weights.
-        slow_s: Time limit for the next part to arrive, s.
-        open_to_network: Whether other machines reach this server without a key; pushes are then refused.
+    Pushes are refused if the server is `open_to_network`, i.e. if other machines reach it without a key.
     """
     endpoint = _WeightsEndpoint(replicas, slow_s, open_to_network)
     return [
@@ -83,28 +76,21 @@ def weights_routes(replicas: ReceivesWeights, slow_s: float, *, open_to_network:
 
 class _WeightsEndpoint:
     def __init__(self, replicas: ReceivesWeights, slow_s: float, open_to_network: bool) -> None:
-        self._replicas = replicas
-        self._slow_s = slow_s
+        self._replicas, self._slow_s = replicas, slow_s
         self._scopes = ScopeCheck("weights", open_to_network=open_to_network)
         self._receiving = False
 
     async def show(self, http: HttpRequest) -> Response:
-        try:
-            self._scopes.require(_SCOPE)
-            return JSONResponse({"versions": await self._replicas.versions_of_weights()})
-        except VLAgentsError as error:
-            return problem_response(error, request_id(http))
+        self._scopes.require(_SCOPE)
+        return JSONResponse({"versions": await self._replicas.versions_of_weights()})
 
     async def rest(self, http: HttpRequest) -> Response:
-        try:
-            self._scopes.require(_SCOPE)
-            rest = _rest(http.path_params["step"], http.query_params)
-            if isinstance(caller := current_caller(), Caller):
-                caller.note("the policy's rest:", rest.step)
-            await self._replicas.rest(rest)
-            return JSONResponse({})
-        except VLAgentsError as error:
-            return problem_response(error, request_id(http))
+        self._scopes.require(_SCOPE)
+        rest = _rest(http.path_params["step"], http.query_params)
+        if isinstance(caller := current_caller(), Caller):
+            caller.note("the policy's rest:", rest.step)
+        await self._replicas.rest(rest)
+        return JSONResponse({})
 
     async def receive(self, socket: WebSocket) -> None:
         try:

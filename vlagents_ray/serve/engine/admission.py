@@ -38,15 +38,10 @@ class Admission:
 
     def __init__(self, in_flight_bytes: int) -> None:
         self._limit = in_flight_bytes
-        self._held = 0
+        self.held = 0  # number of bytes in flight
         self._lock = threading.Lock()
         self._threads: dict[bool, ThreadPoolExecutor] = {}  # the thread pools for robots and (False) for others
         self._closed = False
-
-    @property
-    def held(self) -> int:
-        """Number of bytes in flight."""
-        return self._held
 
     def hold(self, size: int, robot: bool, message_bytes: int) -> None:
         """Count `size` more bytes as in flight for a message that already holds `message_bytes` bytes.
@@ -57,10 +52,10 @@ class Admission:
         """
         most = self._limit if robot else int(self._limit * (1 - _ROBOTS_SHARE))
         with self._lock:
-            if self._held + size <= most:
-                self._held += size
+            if self.held + size <= most:
+                self.held += size
                 return
-            held = self._held
+            held = self.held
         if message_bytes + size > most:
             raise MessageTooLarge(
                 f"message: takes {message_bytes + size} bytes, decoded, and all in flight may take {most}; send fewer "
@@ -74,15 +69,14 @@ class Admission:
     def release(self, size: int) -> None:
         """Count `size` bytes as no longer in flight."""
         with self._lock:
-            self._held -= size
+            self.held -= size
 
     def submit(self, call: Callable[[], T], robot: bool) -> Future[T]:
         """Run `call` on a decoding thread; raise `PolicyUnavailable` after `close`."""
         with self._lock:
             if self._closed:
                 raise PolicyUnavailable("the replica is stopping; connect again")
-            threads = self._threads.get(robot)
-            if threads is None:
+            if (threads := self._threads.get(robot)) is None:
                 number = max(1, thread_map.allowed() - 1 if robot else thread_map.allowed() // 2)
                 name = f"decode-{'robots' if robot else 'others'}"
                 threads = self._threads[robot] = ThreadPoolExecutor(number, name)
@@ -125,8 +119,7 @@ class MessageAdmission(Budget):
         """
         super().__init__(limits)
         self.files = {} if keep_files else None
-        self._admission = admission
-        self._admit = admit
+        self._admission, self._admit = admission, admit
         self.size = size  # size of the message, until it is counted
         self._robot = robot
         self._held = 0  # bytes counted as in flight
@@ -201,11 +194,6 @@ class MessageAdmission(Budget):
             except NeedsDecodingThread:
                 pass
         return await asyncio.wrap_future(self.decode_on_thread(read))
-
-    @property
-    def holds(self) -> bool:
-        """Whether the message counts as in flight."""
-        return self._held > 0
 
     def release(self) -> None:
         """Release the bytes of a message that is answered or dropped."""

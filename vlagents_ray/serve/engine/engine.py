@@ -32,7 +32,6 @@ from vlagents_ray.serve.engine.metrics_buffer import MetricsBuffer
 from vlagents_ray.serve.engine.observer import Observers
 from vlagents_ray.serve.engine.pauses import PauseDetector
 from vlagents_ray.serve.engine.responses import build_reply, public_error, raised_at, require_serializable, timing
-from vlagents_ray.serve.engine.session_transfer import SessionTransfer
 from vlagents_ray.serve.models.checkpoints import Checkpoints
 from vlagents_ray.serve.models.loaded_model import LoadedModel, Loader
 from vlagents_ray.serve.models.model_manager import ModelManager, too_late
@@ -40,7 +39,7 @@ from vlagents_ray.serve.queue.batch_queue import BatchQueue, Taken
 from vlagents_ray.serve.queue.call_limits import CallLimits, PolicyCall, PolicyCalls
 from vlagents_ray.serve.queue.poller import Poller
 from vlagents_ray.serve.queue.preparation import Preparations
-from vlagents_ray.serve.requests import Opening, PendingRequest, Rank
+from vlagents_ray.serve.requests import CheckpointChoice, Opening, PendingRequest, Rank
 from vlagents_ray.serve.sessions import DrainList, Session, SessionFinder, SessionTable
 from vlagents_ray.serve.weights import Rest, WeightsVersion, WeightUpdates, follows
 
@@ -95,12 +94,11 @@ class Engine:
         """
         self._source = agent if isinstance(agent, Checkpoints) else Checkpoints(lambda _: agent)
         self.clock, self.finder = clock, finder
-        self.sessions: SessionTable[LoadedModel] = SessionTable(
-            session_limit, session_idle_s, wall_clock, self._session_ended
-        )
+        self.sessions: SessionTable[LoadedModel] = SessionTable(session_limit, session_idle_s, wall_clock)
         self.calls, self.pauses = PolicyCalls(limits, clock), PauseDetector(clock)
         loader = Loader(self._source, version, batch_sizes, max_batch_size, check, self.calls)
         self.models = ModelManager(self._source, loader, self.sessions)
+        self.sessions.ended = self.models.release
         self.stats, self.admission = MetricsBuffer(), Admission(in_flight_bytes)
         loader.on_out_of_memory, loader.on_gpu_ms = self.stats.out_of_memory, self.stats.gpu
         self._batch_sizes, self._reply_bytes = batch_sizes, reply_bytes
@@ -122,12 +120,11 @@ class Engine:
         )
         self._thread = threading.Thread(target=self._serve, name="policy", daemon=True)
         self._started = threading.Event()  # set when loading the policy has succeeded or failed
-        self._alive = False  # whether a thread takes batches from the queue
+        self.alive = False  # whether a thread takes batches from the queue
         self._unsent: list[tuple[PendingRequest, Reply]] = []  # sent by another thread while the next batch runs
         self._answers = ThreadPoolExecutor(1, "policy-answers")
         self._acting = threading.Lock()  # held while the policy's thread runs a batch, and while the policy sleeps
         self.weights = WeightUpdates(lambda: self.models.own_weights, self.sessions.all, self._acting)
-        self.transfer = SessionTransfer(self.sessions, self.models, self.require_ready)
         self.observers = Observers()
 
     def start(self, *, threaded: bool = True) -> None:
@@ -140,7 +137,7 @@ class Engine:
             PolicyFailed: The policy does not load, or not within the time limit.
         """
         try:
-            self._alive = True
+            self.alive = True
             if threaded:
                 self._thread.start()
                 if not self._started.wait(limit_s := self.calls.limits.load_s):
@@ -166,8 +163,8 @@ class Engine:
             self.models.start()
         except BaseException as error:  # noqa: BLE001 - raised again by start(), on the caller's thread
             self._not_started = error
-            self._alive = False
-            self.queue.release()
+            self.alive = False
+            self.queue.poller.close()
             return
         finally:
             self.queue.bind()
@@ -189,9 +186,9 @@ class Engine:
                 del taken  # their observations may be in the sender's memory
             _send(self._unsent)
             self._answers.shutdown()
-            self.queue.release()
+            self.queue.poller.close()
         finally:
-            self._alive = False
+            self.alive = False
 
     @property
     def ready(self) -> bool:
@@ -206,7 +203,7 @@ class Engine:
         """Raise `PolicyUnavailable` while the policy loads, `PolicyFailed` if it did not load or its thread ended."""
         if self._unready is not None:
             raise self.models.loading() if self._unready is self._loading else self._unready
-        if not self._alive:
+        if not self.alive:
             raise PolicyFailed("the policy's thread has ended")
         if self.calls.broken is not None:
             self.calls.require_device()
@@ -229,8 +226,7 @@ class Engine:
 
         This is called several times a second, on a thread that makes no calls of the policy.
         """
-        call = self.calls.overdue()
-        if call is None:
+        if (call := self.calls.overdue()) is None:
             if self._hung is not None:
                 logger.warning("the policy has returned from %r after all", self._hung.op)
                 self._hung = None
@@ -271,24 +267,14 @@ class Engine:
         for pending in self.queue.close():
             self._fail(pending, PolicyUnavailable("the replica is stopping; connect again"))
         if self._thread.ident is None:
-            self.queue.release()
+            self.queue.poller.close()
         elif self._thread is not threading.current_thread():
             self._thread.join(timeout_s)
-
-    @property
-    def alive(self) -> bool:
-        """Whether the policy's thread takes requests."""
-        return self._alive
 
     @property
     def contract(self) -> Contract | None:
         """Contract of the deployment's own checkpoint; None until that is loaded, or if it has no contract."""
         return self.models.contract
-
-    @property
-    def version(self) -> tuple[str, str]:
-        """Version of the policy; replicas of equal versions can take over each other's sessions."""
-        return self.models.version
 
     def submit(self, requests: Sequence[PendingRequest]) -> None:
         """Check requests, and queue them together; those that cannot be queued are finished with their errors."""
@@ -354,9 +340,7 @@ class Engine:
     def _seek(self, pending: PendingRequest, error: VLAgentsError) -> bool:
         """Search for an act's session at other replicas, and queue the act again; return False if there is no search.
 
-        Args:
-            pending: The act, which fails if its session is not found.
-            error: The error with which it fails.
+        If its session is not found, the act fails with the `error`.
         """
         if self.finder is None or pending.sought or pending.request.op != "act":
             return False
@@ -379,9 +363,6 @@ class Engine:
             pending.fail(PolicyUnavailable("the replica is stopping; connect again, or send the same request again"))
             return True
         return False
-
-    def _session_ended(self, session: Session[LoadedModel]) -> None:
-        self.models.release(session)
 
     def run(self, taken: Taken) -> None:
         """Answer the expired requests, and run the batch. Called on the policy's thread."""
@@ -505,11 +486,11 @@ class Engine:
         """Run a request that is neither an act nor a reset, and return the info of its answer."""
         session_id, request = pending.session_id, pending.request
         if request.op == "export":
-            return self.transfer.export(session_id)
+            return self.export(session_id)
         if request.op == "release":
             return {"released": self.sessions.release(session_id, request.kwargs["version"])}
         if request.op == "adopt":
-            self.transfer.adopt(session_id, request.kwargs)
+            self.adopt(session_id, request.kwargs)
         elif request.op == "observe":
             self._observe(pending)
         elif request.op == "weights":
@@ -606,6 +587,72 @@ class Engine:
         if unsent:
             self._unsent.extend(unsent)
         self.stats.batch(len(acting), rows)
+
+    # Sessions that move between replicas: their state is bytes and settings.
+
+    def export(self, session_id: str) -> dict[str, Any]:
+        """Return the state that another replica needs to continue the session after its release here."""
+        session = self.sessions.get(session_id)
+        model, weights = session.model, session.weights
+        if session.agent is None or model is None or weights is None:
+            raise UnknownSession(f"session {session_id!r}: not reset yet")
+        with model.call("export"):
+            agent = model.copies.dump(session.agent)
+        return {
+            "agent": agent,
+            "steps": session.steps,
+            "first": session.first,
+            "moves": session.moves,
+            "version": list(model.version),
+            "choice": [model.choice.name, model.choice.step],
+            "settings": model.settings,
+            "parameters": [weights.number, weights.fingerprint],
+            "follows": session.follows,
+            "instruction": session.instruction,
+        }
+
+    def adopt(self, session_id: str, state: dict[str, Any], timeout_s: float = 0.0) -> None:
+        """Continue a session that another replica has released.
+
+        Args:
+            session_id: Id of the session.
+            state: The `info` of the other replica's reply to "export".
+            timeout_s: Maximum time for loading the session's checkpoint, s; 0 if it must be loaded already.
+
+        Raises:
+            UnknownSession: The session has, or had, a newer state here, has begun a reset, or needs a checkpoint or a
+                version of the policy that is not available here.
+        """
+        self.enter(self.prepare_adoption(session_id, state, timeout_s))
+
+    def prepare_adoption(self, session_id: str, state: dict[str, Any], timeout_s: float = 0.0) -> Session[LoadedModel]:
+        """Create a copy of the session that cannot act before `enter`; if it is not needed, release its model."""
+        self.require_ready()
+        self.sessions.require_room(session_id)
+        first, moves = state["first"], state["moves"] + 1
+        arriving: Session[LoadedModel] = Session(
+            session_id, steps=state["steps"], first=first, expected=first, moves=moves, announced=True
+        )
+        try:
+            model = self.models.adopt(arriving, CheckpointChoice(*state["choice"]), state["settings"], timeout_s)
+            if tuple(state["version"]) != model.version:
+                raise UnknownSession(f"session {session_id!r}: of another version of the policy; reset it")
+            with model.call("adopt", threading.get_ident()):
+                arriving.agent = model.copies.load(state["agent"])
+            arriving.weights = model.parameters.find(*state["parameters"])
+            arriving.follows, arriving.instruction = state["follows"], state["instruction"]
+        except BaseException:
+            self.models.release(arriving)
+            raise
+        return arriving
+
+    def enter(self, arriving: Session[LoadedModel]) -> None:
+        """Add a prepared session to the table, so that it acts here from now on."""
+        try:
+            self.sessions.enter(arriving)
+        except BaseException:
+            self.models.release(arriving)
+            raise
 
 
 def _send(answers: Sequence[tuple[PendingRequest, Reply]]) -> None:

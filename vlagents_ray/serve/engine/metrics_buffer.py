@@ -72,8 +72,7 @@ class MetricsBuffer:
         if not self._enabled:
             return
         with self._lock:
-            sample = self._collected.requests.get(kind)
-            if sample is None:
+            if (sample := self._collected.requests.get(kind)) is None:
                 sample = self._collected.requests[kind] = Sample()
             sample.add(times)
 

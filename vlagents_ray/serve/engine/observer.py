@@ -9,8 +9,7 @@ from __future__ import annotations
 
 import logging
 import threading
-from collections.abc import Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 
 from vlagents_ray.protocol.messages import Reply
 from vlagents_ray.serve.requests import PendingRequest
@@ -56,26 +55,19 @@ class Observers(Observer):
 
     def on_request(self, pending: PendingRequest) -> None:
         """Call all observers with a request; their errors are logged, and do not affect the answer."""
-        for observer in self._all:
-            with _logged(observer):
-                observer.on_request(pending)
+        self._each(lambda observer: observer.on_request(pending))
 
     def before_answer(self, pending: PendingRequest, reply: Reply) -> None:
         """Call all observers before an answer is sent; their errors are logged."""
-        for observer in self._all:
-            with _logged(observer):
-                observer.before_answer(pending, reply)
+        self._each(lambda observer: observer.before_answer(pending, reply))
 
     def on_answer(self, pending: PendingRequest, reply: Reply) -> None:
         """Call all observers with an answer; their errors are logged."""
+        self._each(lambda observer: observer.on_answer(pending, reply))
+
+    def _each(self, call: Callable[[Observer], None]) -> None:
         for observer in self._all:
-            with _logged(observer):
-                observer.on_answer(pending, reply)
-
-
-@contextmanager
-def _logged(observer: Observer) -> Iterator[None]:
-    try:
-        yield
-    except Exception:
-        logger.exception("%s: a request is left out", type(observer).__name__)
+            try:
+                call(observer)
+            except Exception:
+                logger.exception("%s: a request is left out", type(observer).__name__)

@@ -6,7 +6,7 @@ import asyncio
 import uuid
 from collections.abc import Sequence
 from functools import partial
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, TypeVar
 
 from vlagents_ray.errors import DeadlineExceeded, OutcomeUnknown, TooManyRequests, VLAgentsError
 from vlagents_ray.protocol.frames import Decoded
@@ -18,6 +18,7 @@ from vlagents_ray.serve.requests import RANKS, Answered, Message, Origin, Pendin
 if TYPE_CHECKING:
     from vlagents_ray.serve.engine.engine import Engine
 
+T = TypeVar("T")
 
 REFUSALS = 8  # number of consecutive messages over the rate of the key after which a connection ends
 REFUSED = f"over the rate of its key {REFUSALS} times in a row; send less, or raise the rate"
@@ -199,7 +200,7 @@ class Sender:
         if self._asked_to_reconnect or self._engine.draining:
             for reply in message.replies:
                 reply.draining = True  # the client reconnects, and its sessions move to another replica
-        if admission is not None and admission.holds:
+        if admission is not None:
             admission.release()
         observers = self._engine.observers
         for pending in watched:
@@ -217,8 +218,9 @@ class Sender:
         loop = asyncio.get_running_loop()
         future: asyncio.Future[list[Reply]] = loop.create_future()
         waited_s = self._engine.pauses.waited_s()
-        then = partial(_deliver, loop, future)
-        sent = self.send(message, decoded, then, admission=admission, waited_s=waited_s)
+        sent = self.send(
+            message, decoded, lambda done: settle(future, done.replies), admission=admission, waited_s=waited_s
+        )
         timer = None
         if sent and all(request.deadline_ms is not None for request in decoded.requests):
             last_s = max(pending.deadline for pending in sent) - sent[0].arrived
@@ -266,10 +268,11 @@ class Sender:
         return caller.rank != "simulation"
 
 
-def _deliver(loop: asyncio.AbstractEventLoop, future: asyncio.Future[list[Reply]], message: Message) -> None:
-    loop.call_soon_threadsafe(_settle, future, message.replies)
+def settle(future: asyncio.Future[T], result: T) -> None:
+    """Set the result of a future, from any thread, unless its caller no longer waits."""
 
+    def set_result() -> None:
+        if not future.done():
+            future.set_result(result)
 
-def _settle(future: asyncio.Future[list[Reply]], replies: list[Reply]) -> None:
-    if not future.done():
-        future.set_result(replies)
+    future.get_loop().call_soon_threadsafe(set_result)

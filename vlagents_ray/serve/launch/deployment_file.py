@@ -18,10 +18,10 @@ from vlagents_ray.policies.wrapper import build_agent
 from vlagents_ray.ray_tools.runtime_env import require_no_secrets
 from vlagents_ray.registry import names, policy_class
 from vlagents_ray.serve.config.deployment import POLICY, ServerArgs
-from vlagents_ray.serve.dialects.routes import require_fit, require_packages
-from vlagents_ray.serve.models.checkpoints import CHOICE, STEP
+from vlagents_ray.serve.models.checkpoints import CHOICE, STEP, Checkpoints
 from vlagents_ray.serve.python_env.child_main import unloaded_contract
 from vlagents_ray.serve.python_env.probe import check_policy, with_process
+from vlagents_ray.serve.requests import DEFAULT
 from vlagents_ray.settings import wrong_settings
 
 IMPORT_PATH = "vlagents_ray.serve.app:build"
@@ -169,13 +169,9 @@ def stated_contract(config: ServeDeploySchema) -> Contract | None:
     app, *others = config.applications
     if others or app.import_path != IMPORT_PATH or app.runtime_env:
         return None
-    args, own = ServerArgs(**app.args), own_settings(app)
-    environment = args.environment
-    offered = args.checkpoints.of(partial(build_agent, args.policy, wrappers=args.wrappers), own)
-    settings = offered.settings(offered.examples()[0], offered.config)
-    if environment.python is not None:
-        return check_policy(environment, args.policy, settings, args.wrappers)
-    return unloaded_contract(offered.make(settings))
+    args = ServerArgs(**app.args)
+    offered = args.checkpoints.of(partial(build_agent, args.policy, wrappers=args.wrappers), own_settings(app))
+    return _contract(args, offered, offered.settings(DEFAULT, offered.config))
 
 
 def our_apps(config: ServeDeploySchema) -> list[Any]:
@@ -225,21 +221,23 @@ def _require_policy(args: ServerArgs, own: dict[str, Any], *, installed: bool, s
     A replica repeats the check. If the policy's packages are not `installed` here, the application's `runtime_env` adds
     them. With `step_follows`, a missing step is set later.
     """
-    environment = args.environment
     if not installed:
-        if environment.python is None:
+        if args.environment.python is None:
             policy_class(args.policy)
         else:
-            with_process(environment)
+            with_process(args.environment)
         return
-    require_packages(args.dialects)
+    args.dialects.require_packages()
     offered = args.checkpoints.of(partial(build_agent, args.policy, wrappers=args.wrappers), own)
     for choice in offered.examples():
         settings = offered.settings(choice, offered.config)
         if step_follows and STEP_PLACE in str(settings.get(CHOICE)) and settings.get(STEP) is None:
             settings |= {STEP: 0}
-        if environment.python is not None:
-            contract = check_policy(environment, args.policy, settings, args.wrappers)
-        else:
-            contract = unloaded_contract(offered.make(settings))
-        require_fit(args.dialects, contract)
+        args.dialects.require_fit(_contract(args, offered, settings))
+
+
+def _contract(args: ServerArgs, offered: Checkpoints, settings: dict[str, Any]) -> Contract | None:
+    """Build the policy in its environment with these settings, and return its contract, if it has one already."""
+    if args.environment.python is not None:
+        return check_policy(args.environment, args.policy, settings, args.wrappers)
+    return unloaded_contract(offered.make(settings))

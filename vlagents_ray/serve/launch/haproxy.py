@@ -24,7 +24,7 @@ from vlagents_ray.errors import ConfigError, NoReplica, PolicyUnavailable
 from vlagents_ray.protocol.json_messages import PROBLEM_TYPE, problem
 from vlagents_ray.ray_tools.reaper import MARK
 from vlagents_ray.serve.config.deployment import POLICY
-from vlagents_ray.serve.ports import LOOPBACK, free_block, free_ports
+from vlagents_ray.serve.ports import EVERYWHERE, LOOPBACK, free_block, free_port
 
 _BALANCE = "RAY_SERVE_HAPROXY_BALANCE_ALGORITHM"  # the last line of HAProxy's common settings
 _BINARY = "RAY_SERVE_HAPROXY_BINARY_PATH"
@@ -115,11 +115,9 @@ class PublicListener:
 
     def settings(self) -> str:
         """Return a section of HAProxy's settings for this listener."""
-        tls = (
-            ""
-            if self.bundle is None
-            else f' ssl crt "{self.bundle}" ssl-min-ver TLSv1.2 ciphers {_CIPHERS} alpn http/1.1'
-        )
+        tls = ""
+        if self.bundle is not None:
+            tls = f' ssl crt "{self.bundle}" ssl-min-ver TLSv1.2 ciphers {_CIPHERS} alpn http/1.1'
         if self.client_ca is not None:
             tls += f' ca-file "{self.client_ca}" verify required'
         bind, server = f"bind {self.host}:{self.port}{tls}", f"server inside {LOOPBACK}:{self.inside}"
@@ -156,7 +154,8 @@ def haproxy_binary() -> str | None:
 def ingress_environment(folder: Path, binary: str, listener: PublicListener | None = None) -> dict[str, str]:
     """Return the environment variables of a cluster whose ingress is this HAProxy, with files in `folder`."""
     replicas = free_block(_REPLICA_PORTS)
-    metrics, stats, fallback = free_ports(3)
+    # On all addresses, as HAProxy's metrics and statistics listen on all.
+    metrics, stats, fallback = (free_port(EVERYWHERE) for _ in range(3))
     return {
         **ROBOTS,
         "RAY_SERVE_HTTP_PROXY_CALLBACK_IMPORT_PATH": "vlagents_ray.serve.endpoints.front:middlewares",

@@ -19,31 +19,14 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+import ray
+from ray import serve
+from ray.serve.exceptions import RayServeException
 from ray.serve.schema import ServeDeploySchema
 
 from vlagents_ray.errors import ConfigError, PolicyUnavailable
-from vlagents_ray.ray_tools.private import (
-    end_controller,
-    forget_serve,
-    gpus_here,
-    long_polls,
-    proxies_now,
-    start_serve,
-    use_loopback,
-)
+from vlagents_ray.ray_tools import head_monitor, private, session
 from vlagents_ray.ray_tools.reaper import MARK
-from vlagents_ray.ray_tools.session import (
-    ALONE,
-    MODE,
-    announce,
-    joined,
-    leave_ray,
-    ray_folder,
-    start_ray,
-    started_here,
-    unless_lost,
-    variables,
-)
 from vlagents_ray.serve.access.api_keys import require_access, warn_of_plain_http
 from vlagents_ray.serve.config.deployment import AccessArgs, ServerArgs
 from vlagents_ray.serve.launch.deployment_file import our_apps, with_gateways_at, with_replicas_on
@@ -75,8 +58,6 @@ def wait_for_proxies(proxies: list[Any], look_again: Callable[[], list[Any]]) ->
     Serve kills a proxy that does not start within some seconds, as on a busy node, and starts another one: `look_again`
     returns the refs of the current ones.
     """
-    import ray
-
     deadline = time.monotonic() + _PROXIES_S
     while True:
         try:
@@ -97,20 +78,16 @@ def shut_down(client: Any) -> None:
     to the whole process group or service, such as systemd's SIGTERM, also ends Ray's head: then Serve can neither
     answer nor continue, and the reaper ends its processes.
     """
-    import ray
-
-    from vlagents_ray.ray_tools.head_monitor import head_is_gone
-
-    for poll in long_polls(client):  # Ray would report a call in progress at the controller's end as a failed task
+    for poll in private.long_polls(client):  # Ray would report a call in progress at the end as a failed task
         poll.stop()
     client.shutdown_cached_handles()
-    last = end_controller(client)
+    last = private.end_controller(client)
     deadline = time.monotonic() + _SHUTDOWN_S
-    while not ray.wait([last], timeout=_LOOK_S)[0] and not head_is_gone():
+    while not ray.wait([last], timeout=_LOOK_S)[0] and not head_monitor.head_is_gone():
         if time.monotonic() > deadline:
             log.warning("Serve has not ended within %g s and is left behind", _SHUTDOWN_S)
             break
-    forget_serve(client)
+    private.forget_serve(client)
 
 
 __all__ = ["Server", "deploy", "free_port", "running_server", "spread_over_gpus"]
@@ -167,32 +144,27 @@ def running_server(
     config = with_gateways_at(config, host)
     config = _access(config, keys_file, insecure, plain_http)
     if address is None:  # otherwise each replica checks and warns on its own machine
-        _require_access(config, host, insecure)
-        _warn_of_plain_http(config, host, tls)
+        _check_access(config, host, insecure, tls)
     if tls is not None:
         tls.check()
     for app in our_apps(config):
         keep(*(one.port for one in ServerArgs(**app.args).dialects.gateways().values()))
-    import ray
-    from ray import serve
-
     own = address is None and not ray.is_initialized()
     if own:
-        _require_gpus(config, gpus_here())
+        _require_gpus(config, private.gpus_here())
     with contextlib.ExitStack() as stack:
         ingress = ingress or not own or len(our_apps(config)) < len(config.applications)
         public = port or free_port(host)
         http = stack.enter_context(_ray(address, host, public, tls, num_cpus, ingress))
         location = "Disabled" if not ingress else "HeadOnly" if address is None else "EveryNode"
-        client, proxies = start_serve(http, location)
+        client, proxies = private.start_serve(http, location)
         if running := sorted(serve.status().applications):
             raise ConfigError(
                 f"Serve runs {running} on this cluster already; use their URL (serve://{running[0]} inside the "
                 f"cluster), or `serve deploy` one file that holds those and yours"
             )
-        stack.push(unless_lost(lambda: shut_down(client)))
+        stack.push(session.unless_lost(lambda: shut_down(client)))
         _require_gpus(config)
-        remind = functools.partial(_missing_gpus, config)
         deploy(client, config, own=own, ingress=ingress)
         url = f"{'http' if tls is None else 'https'}://{LOOPBACK if host == EVERYWHERE else host}:{public}"
         paths = {app.name: (app.route_prefix or "").rstrip("/") for app in config.applications}
@@ -203,12 +175,12 @@ def running_server(
         inside += f"://{LOOPBACK if http['host'] == EVERYWHERE else http['host']}:{http['port']}"
         ours = {app.name for app in our_apps(config)}
         urls = {name: inside + path if ingress else None for name, path in paths.items()}
-        wait_for_proxies(proxies, lambda: proxies_now(client))
-        wait_until_ready(serve, urls, ours, deadline, remind)
+        wait_for_proxies(proxies, lambda: private.proxies_now(client))
+        wait_until_ready(serve, urls, ours, deadline, functools.partial(_missing_gpus, config))
         if ingress and address is None and (stats_port := os.environ.get("RAY_SERVE_HAPROXY_STATS_PORT")):
             wait_for_haproxy(serve, paths, int(stats_port), deadline)
         if own and ingress:
-            announce(url, paths, ray.get_runtime_context().gcs_address)
+            session.announce(url, paths, ray.get_runtime_context().gcs_address)
         yield Server(url, {name: url + path for name, path in paths.items()})
 
 
@@ -236,9 +208,7 @@ def deploy(client: Any, config: ServeDeploySchema, *, own: bool, ingress: bool) 
     deployed again, and Serve would replace all replicas of an application that it did not build. Without `ingress`,
     replicas end without waiting for requests, since their clients have already ended.
     """
-    from ray import serve
-
-    from vlagents_ray.serve.replica.app import build
+    from vlagents_ray.serve.app import application
 
     stated = [app.model_dump(exclude_defaults=True).keys() for app in config.applications]
     ours = len(our_apps(config)) == len(config.applications)
@@ -247,7 +217,7 @@ def deploy(client: Any, config: ServeDeploySchema, *, own: bool, ingress: bool) 
         client.deploy_apps(config)
         return
     targets = [
-        serve.RunTarget(build(ServerArgs(**app.args), drains=ingress), name=app.name, route_prefix=app.route_prefix)
+        serve.RunTarget(application(ServerArgs(**app.args), drains=ingress), app.name, app.route_prefix)
         for app in config.applications
     ]
     serve.run_many(targets, wait_for_ingress_deployment_creation=False, wait_for_applications_running=False)
@@ -259,7 +229,7 @@ def _require_gpus(config: ServeDeploySchema, here: float | None = None) -> None:
     `here` is the number of GPUs that a new local Ray would have. An existing cluster may grow: there, missing GPUs
     cause a warning, which is repeated while the replicas wait.
     """
-    if here is None and not started_here():
+    if here is None and not session.started_here():
         return
     if (missing := _missing_gpus(config, here)) is not None:
         raise ConfigError(f"{missing}; where there are more, see `vlagents-ray doctor`")
@@ -267,13 +237,11 @@ def _require_gpus(config: ServeDeploySchema, here: float | None = None) -> None:
 
 def _missing_gpus(config: ServeDeploySchema, here: float | None = None) -> str | None:
     """Return a sentence about the GPUs that this machine, or the running cluster, lacks; None if it has enough."""
-    import ray
-
     wanted = {app.name: _gpus(ServerArgs(**app.args)) for app in our_apps(config)}
     there = ray.cluster_resources().get("GPU", 0.0) if here is None else here
     if sum(wanted.values()) <= there:
         return None
-    where = "this machine" if here is not None or started_here() else "this cluster"
+    where = "this machine" if here is not None or session.started_here() else "this cluster"
     return (
         f"resources.num_gpus: the replicas of {wanted} need {sum(wanted.values()):g} GPUs, {where} has {there:g}; "
         f"want less (0 runs on the CPU), or add a machine that has them"
@@ -288,17 +256,18 @@ def _gpus(args: ServerArgs) -> float:
     return replicas * args.resources.num_gpus
 
 
-def _require_access(config: ServeDeploySchema, host: str, insecure: bool) -> None:
-    """Raise `ConfigError` if an application accepts other machines without keys, or its keys cannot be read."""
-    ours = our_apps(config)
+def _check_access(config: ServeDeploySchema, host: str, insecure: bool, tls: Tls | None) -> None:
+    """Check the access to each application, and warn if keys would cross the network unencrypted.
+
+    Raises:
+        ConfigError: An application accepts other machines without keys, or its keys cannot be read.
+    """
+    ours, plain = our_apps(config), False
     for app in config.applications:  # applications of other packages require no keys
         access = AccessArgs(**app.args.get("access", {})) if app in ours else AccessArgs(insecure=insecure)
-        require_access(host, access.keys() if app in ours else None, access.insecure)
-
-
-def _warn_of_plain_http(config: ServeDeploySchema, host: str, tls: Tls | None) -> None:
-    stated = [AccessArgs(**app.args.get("access", {})) for app in our_apps(config)]
-    if tls is None and any(access.keys() is not None and not access.plain_http for access in stated):
+        require_access(host, keys := access.keys() if app in ours else None, access.insecure)
+        plain = plain or (keys is not None and not access.plain_http)
+    if plain and tls is None:
         warn_of_plain_http(host)
 
 
@@ -307,11 +276,16 @@ def _ray(
     address: str | None, host: str, port: int, tls: Tls | None, num_cpus: int | None, ingress: bool
 ) -> Iterator[dict[str, Any]]:
     """Connect to a Ray or start one; yield Serve's options for its host, port and certificate."""
-    import ray
-
     if not ray.is_initialized() and address is None:
         with own_ray(host, port, tls=tls, num_cpus=num_cpus, ingress=ingress) as listener:
-            yield _serve_address(listener, host, port, tls)
+            if listener is not None:
+                yield {"host": LOOPBACK, "port": listener.inside}
+            elif tls is None:
+                yield {"host": host, "port": port}
+            elif tls.client_ca is None:
+                yield {"host": host, "port": port, "ssl_certfile": str(tls.certificate), "ssl_keyfile": str(tls.key)}
+            else:
+                raise ConfigError("TLS with certificates of clients needs HAProxy: pip install 'vlagents-ray[serve]'")
         return
     if tls is not None:
         raise ConfigError(
@@ -324,27 +298,14 @@ def _ray(
             f"host {host}: with HAProxy Serve would find no replica at a single address; "
             f"use {EVERYWHERE} (or {LOOPBACK}), or leave ray.init() to this function"
         )
-    with joined(address):
+    with session.joined(address):
         yield {"host": host, "port": port}
 
 
 def spread_over_gpus(parts: Mapping[str, ServeDeploySchema], *, kept: float = 0.0) -> dict[str, ServeDeploySchema]:
     """Return deployments that share the GPUs of the connected cluster equally, except for `kept` GPUs."""
-    import ray
-
     share = max(0.0, ray.cluster_resources().get("GPU", 0.0) - kept) / len(parts)
     return {name: with_replicas_on(part, share) for name, part in parts.items()}
-
-
-def _serve_address(listener: PublicListener | None, host: str, port: int, tls: Tls | None) -> dict[str, Any]:
-    """Return Serve's own host, port and certificate."""
-    if listener is not None:
-        return {"host": LOOPBACK, "port": listener.inside}
-    if tls is None:
-        return {"host": host, "port": port}
-    if tls.client_ca is not None:
-        raise ConfigError("TLS with certificates of clients needs HAProxy: pip install 'vlagents-ray[serve]'")
-    return {"host": host, "port": port, "ssl_certfile": str(tls.certificate), "ssl_keyfile": str(tls.key)}
 
 
 @contextlib.contextmanager
@@ -362,25 +323,28 @@ def own_ray(
         ConfigError: The port is in use, or the environment excludes Ray's token or HAProxy's settings.
     """
 
-    if os.environ.get(MODE, "token").lower() != "token":
+    if os.environ.get(session.MODE, "token").lower() != "token":
         raise ConfigError(
-            f"{MODE}={os.environ[MODE]}: a port of each replica, which runs whatever it is sent, would be open to "
-            f"other machines without Ray's token; unset it"
+            f"{session.MODE}={os.environ[session.MODE]}: a port of each replica, which runs whatever it is sent, "
+            f"would be open to other machines without Ray's token; unset it"
         )
     if not is_free(host, port):
         raise ConfigError(f"cannot listen on {host}:{port}: it is taken; choose another --port or --host")
     keep(port)
-    with ray_folder() as folder, contextlib.ExitStack() as stack:
+    with session.ray_folder() as folder, contextlib.ExitStack() as stack:
         # By default Ray starts workers with a low priority, so that a policy would wait for all other processes.
         # Proxies start while policies load: on a slow machine Serve would replace them after three times its 5 s.
         environment = {"RAY_worker_niceness": "0", "RAY_SERVE_PROXY_READY_CHECK_TIMEOUT_S": "60"}
         # The address at which replicas listen for WebSockets: loopback if only TLS may cross the network.
-        ours = {MARK: str(folder), ALONE: "0", HOST: host if tls is None else LOOPBACK}
+        ours = {MARK: str(folder), session.ALONE: "0", HOST: host if tls is None else LOOPBACK}
         listener = None
         if not ingress:
             ours |= NO_INGRESS
         elif (binary := haproxy_binary()) is not None:
-            listener = _public_listener(folder, host, port, tls)
+            if tls is not None or host not in (LOOPBACK, "localhost"):
+                bundle = None if tls is None else tls.bundle(folder)
+                client_ca = None if tls is None or tls.client_ca is None else tls.client_ca.absolute()
+                listener = PublicListener(host, port, free_port(), bundle, client_ca)
             settings = ingress_environment(folder, binary, listener)
             # HAProxy's files and admin socket are in the folder, regardless of the user's settings for clusters.
             ours |= {key: value for key, value in settings.items() if value.startswith(str(folder))}
@@ -389,25 +353,13 @@ def own_ray(
         # replaced. Otherwise the user's values are kept, unless they are in `ours`.
         inherited = MARK in os.environ
         new = {key: value for key, value in environment.items() if inherited or key not in os.environ}
-        stack.enter_context(variables(new | ours))
-        stack.callback(use_loopback, use_loopback(True))  # this process read `ALONE` when it imported Ray
+        stack.enter_context(session.variables(new | ours))
+        stack.callback(private.use_loopback, private.use_loopback(True))  # `ALONE` was read when Ray was imported
         if listener is not None:
             listener.require()
-        start_ray(folder, num_cpus=num_cpus, logging_level="WARNING")
-        stack.push(unless_lost(leave_ray))
+        session.start_ray(folder, num_cpus=num_cpus, logging_level="WARNING")
+        stack.push(session.unless_lost(session.leave_ray))
         yield listener
-
-
-def _public_listener(folder: Path, host: str, port: int, tls: Tls | None) -> PublicListener | None:
-    if tls is None and host in (LOOPBACK, "localhost"):
-        return None
-    return PublicListener(
-        host,
-        port,
-        free_port(),
-        None if tls is None else tls.bundle(folder),
-        None if tls is None or tls.client_ca is None else tls.client_ca.absolute(),
-    )
 
 
 def wait_until_ready(
@@ -436,7 +388,11 @@ def wait_until_ready(
         for name in apps:
             app = status.get(name)
             if app is not None and app.status in ("DEPLOY_FAILED", "UNHEALTHY"):
-                raise ConfigError(f"application {name!r} failed to deploy: {_reason(app)}")
+                # The last line of Serve's message is the error below its traceback.
+                texts = [app.message, *(d.message for d in app.deployments.values())]
+                lines = [line.strip() for text in texts for line in (text or "").splitlines() if line.strip()]
+                reason = lines[-1] if lines else "Serve gives no reason"
+                raise ConfigError(f"application {name!r} failed to deploy: {reason}")
         if all(name in status and status[name].status == "RUNNING" for name in apps):
             break
         if time.monotonic() > deadline:
@@ -464,7 +420,11 @@ def _unready_reason(serve: Any, app: str, url: str | None, ours: Collection[str]
     refusal = None if url is None else _http_reason(url)
     if app not in ours or (url is not None and refusal is None):
         return refusal
-    return _replica_reason(serve, app) or refusal
+    try:
+        said: str | None = serve.get_app_handle(app).refusal.remote().result(timeout_s=5)
+    except (ray.exceptions.RayError, RayServeException, TimeoutError) as error:
+        said = str(error) or type(error).__name__
+    return said or refusal
 
 
 def _http_reason(url: str) -> str | None:
@@ -478,22 +438,3 @@ def _http_reason(url: str) -> str | None:
         return f"HTTP {error.code}"
     except OSError as error:
         return str(error)
-
-
-def _replica_reason(serve: Any, app: str) -> str | None:
-    """Return the reason why the policy cannot act yet, as its replica reports it; None if it can act."""
-    from ray.exceptions import RayError
-    from ray.serve.exceptions import RayServeException
-
-    try:
-        refusal: str | None = serve.get_app_handle(app).refusal.remote().result(timeout_s=5)
-    except (RayError, RayServeException, TimeoutError) as error:
-        return str(error) or type(error).__name__
-    return refusal
-
-
-def _reason(app: Any) -> str:
-    """Return the last line of Serve's message about a failure, which is the error below its traceback."""
-    texts = [app.message, *(d.message for d in app.deployments.values())]
-    lines = [line.strip() for text in texts for line in (text or "").splitlines() if line.strip()]
-    return lines[-1] if lines else "Serve gives no reason"

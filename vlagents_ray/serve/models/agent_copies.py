@@ -45,19 +45,14 @@ class _Shared:
     def __init__(self) -> None:
         self.objects: list[Any] = []
         self.refused: set[str] = set()
-        self._numbers: dict[int, int] = {}
+        self.numbers: dict[int, int] = {}  # indices in `objects` by id
         torch = sys.modules.get("torch")
         self._parameter: type | None = torch.nn.Parameter if torch is not None else None
 
-    def number(self, obj: Any) -> int | None:
-        """Return the index of an object if it is shared, otherwise None."""
-        return self._numbers.get(id(obj))
-
     def add(self, obj: Any) -> int:
         """Add an object to the shared ones, and return its index."""
-        number = self._numbers.get(id(obj))
-        if number is None:
-            number = self._numbers[id(obj)] = len(self.objects)
+        if (number := self.numbers.get(id(obj))) is None:
+            number = self.numbers[id(obj)] = len(self.objects)
             self.objects.append(obj)
         return number
 
@@ -96,12 +91,11 @@ class _Pickler(pickle.Pickler):
 
     def __init__(self, file: io.BytesIO, shared: _Shared, *, find: bool) -> None:
         super().__init__(file, protocol=pickle.HIGHEST_PROTOCOL)
-        self._shared = shared
-        self._find = find
+        self._shared, self._find = shared, find
 
     def persistent_id(self, obj: Any) -> int | None:
         """Return the index of a shared object, or None for an object that is copied."""
-        number = self._shared.number(obj)
+        number = self._shared.numbers.get(id(obj))
         if number is None and self._find and type(obj) not in _PLAIN and self._shared.must_have(obj):
             number = self._shared.add(obj)
         return number
@@ -124,7 +118,7 @@ class AgentCopies:
         for item in agent.shared_objects():
             if type(item) not in _PLAIN or item:
                 self._shared.add(item)
-        self._pristine = self._dump(agent, find=True)
+        self._pristine = self.dump(agent, find=True)
         self.fingerprint = self._shared.fingerprint()
         if self._shared.refused:
             logger.warning(
@@ -138,19 +132,19 @@ class AgentCopies:
         """Return a pristine copy: the agent in its state after `initialize`."""
         return self.load(self._pristine)
 
-    def dump(self, agent: Agent) -> bytes:
-        """Pickle the private state of a copy, for `load` in another replica; raises any error of pickling."""
-        return self._dump(agent, find=False)
+    def dump(self, agent: Agent, *, find: bool = False) -> bytes:
+        """Pickle the private state of a copy, for `load` in another replica; raises any error of pickling.
+
+        With `find`, objects that copies must share are added to the shared ones.
+        """
+        file = io.BytesIO()
+        _Pickler(file, self._shared, find=find).dump(agent)
+        return file.getvalue()
 
     def load(self, data: bytes) -> Agent:
         """Return the copy that `dump` wrote in this replica, or in one with the same fingerprint."""
         agent: Agent = _Unpickler(data, self._shared).load()
         return agent
-
-    def _dump(self, agent: Agent, *, find: bool) -> bytes:
-        file = io.BytesIO()
-        _Pickler(file, self._shared, find=find).dump(agent)
-        return file.getvalue()
 
 
 def _shape(obj: Any) -> tuple[int, ...] | None:

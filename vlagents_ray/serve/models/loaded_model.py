@@ -160,8 +160,7 @@ class LoadedModel:
 
         Calls with the same `op` and `kind` take similarly long, and never run on two threads at once.
         """
-        call = self._calls_by_kind.get((op, kind))
-        if call is None:
+        if (call := self._calls_by_kind.get((op, kind))) is None:
             call = self._calls_by_kind[op, kind] = PolicyCall(self.calls, op)
         return call
 
@@ -207,12 +206,9 @@ class Loader:
         calls: PolicyCalls,
     ) -> None:
         """Create the loader; its arguments are described at `Engine`."""
-        self._source = source
-        self._version = version
-        self._batch_sizes = batch_sizes
+        self._source, self._version, self._batch_sizes = source, version, batch_sizes
         self._compiled_sizes = batch_sizes or powers_up_to(max_batch_size)
-        self._check = check
-        self._calls = calls
+        self._check, self._calls = check, calls
         self.on_progress: Callable[[str], None] = lambda _: None  # called with each step of a long load
         self.on_out_of_memory: Callable[[], None] = lambda: None  # called each time that a model runs out of memory
         self.on_gpu_ms: Callable[[float], None] = lambda _: None  # called with the time of forward passes on a GPU
@@ -221,9 +217,7 @@ class Loader:
         """Load a model into `agent`, by default a new one; the agent is closed if it cannot be served.
 
         Args:
-            choice: The choice for which the model is loaded.
-            settings: Settings of the agent.
-            agent: An agent created from these settings, but not initialized yet.
+            agent: An agent created from the `settings`, but not initialized yet.
 
         Raises:
             BaseException: Any error of the agent's initialization, or of the deployment's check of its contract.

@@ -159,8 +159,7 @@ class ModelCache:
         for model in idle:
             if not self.offers(model.choice, model.settings):
                 return EvictTask(model.key)
-        wanted = self._most_wanted()
-        if wanted is None:
+        if (wanted := self._most_wanted()) is None:
             return None
         task, since = wanted
         limit = self._source.limit
@@ -212,13 +211,7 @@ class ModelManager:
     """The models of a replica. Thread-safe; it releases its lock before it calls other components."""
 
     def __init__(self, source: Checkpoints, loader: Loader, sessions: SessionTable[LoadedModel]) -> None:
-        """Manage the models of a replica.
-
-        Args:
-            source: The offered checkpoints.
-            loader: Loads the models.
-            sessions: The sessions; those of a model are closed if it is evicted at once.
-        """
+        """Manage the models of a replica; the `sessions` of a model that is evicted at once are closed."""
         self.continues_plans = False  # whether chunks of the deployment's own model continue the executed plan
         self.contract: Contract | None = None  # contract of the deployment's own model that was loaded last
         self.weights: dict[str, Any] | None = None  # weights of the deployment's own model that was loaded last
@@ -226,8 +219,7 @@ class ModelManager:
         self.files: Program = {}  # digests of the files named in the settings of that model
         self.step = ""  # the step of a long first load, such as "compiling 4 rows (3 of 5)"
         self.on_step: Callable[[str], None] = lambda _: None  # called with `step`, on the loading thread
-        self._source = source
-        self._loader = loader
+        self._source, self._loader = source, loader
         loader.on_progress = self._set_step
         self._sessions = sessions
         self._first: Agent | None = None
@@ -346,7 +338,6 @@ class ModelManager:
 
         Args:
             session: The session; it releases the model that it held before.
-            choice: The chosen checkpoint.
             on_loaded: Called if the model has to be loaded or waited for: with None once the session holds it, or with
                 the error.
             is_abandoned: Returns whether the caller no longer waits.
@@ -357,8 +348,7 @@ class ModelManager:
         with self._changed:
             self._require_open()
             self.release_model(session)
-            model = self._cache.free(choice)
-            if model is not None and not session.over:
+            if (model := self._cache.free(choice)) is not None and not session.over:
                 return self._cache.assign(session, model)
             self._cache.waiting.append(Waiter(session, choice, on_loaded, is_abandoned))
             self._wake()
@@ -376,8 +366,7 @@ class ModelManager:
         """
         with self._changed:
             self._require_open()
-            model = self._cache.loaded.get(key_of(settings))
-            if model is not None:
+            if (model := self._cache.loaded.get(key_of(settings))) is not None:
                 return self._cache.assign(session, model)
             if timeout_s <= 0 or not self._cache.offers(choice, settings):
                 raise UnknownSession(f"session {session.id!r}: {choice} is not loaded here; reset it")

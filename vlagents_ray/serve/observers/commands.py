@@ -69,9 +69,7 @@ class CommandBoard:
 
         `save` writes the last seconds of a session and returns the path; it may be slow, and may raise errors.
         """
-        self._save = save
-        self._sessions = sessions
-        self._clock = clock
+        self._save, self._sessions, self._clock = save, sessions, clock
         self._numbers = itertools.count(1)
         self._prefix = uuid.uuid4().hex[:8]
         self._presses: dict[str, list[Press]] = {}  # by session, oldest first
@@ -112,8 +110,7 @@ class CommandBoard:
 
     def read_outcomes(self, session_id: str, request: Request) -> None:
         """Read the outcomes of earlier commands that a session's request reports."""
-        held = self._presses.get(session_id)
-        if not held or request.obs is None:
+        if not (held := self._presses.get(session_id)) or request.obs is None:
             return
         stated = request.obs.info.get(COMMANDED)
         outcomes = stated if isinstance(stated, dict) else {}
@@ -129,8 +126,7 @@ class CommandBoard:
 
     def send(self, session_id: str, reply: Reply) -> None:
         """Add the oldest waiting command to the answer to a session's act; "stop" has priority."""
-        held = self._presses.get(session_id)
-        if not held or reply.act is None:
+        if not (held := self._presses.get(session_id)) or reply.act is None:
             return
         with self._lock:
             self._expire(held)

@@ -106,12 +106,8 @@ class EpisodeWriter:
         """
         self.saved = 0  # number of frames in complete episodes
         self.lost = 0  # number of frames in episodes that could not be written
-        self._folder = folder
-        self._name = name
-        self._fps = fps
-        self._lossless = lossless
-        self._most_bytes = most_bytes
-        self._describe = describe
+        self._folder, self._name, self._fps = folder, name, fps
+        self._lossless, self._most_bytes, self._describe = lossless, most_bytes, describe
         self._shelves: list[_Shelf] = []
         self._running: dict[str, _Running] = {}
         self._numbers = 0
@@ -120,11 +116,7 @@ class EpisodeWriter:
     def begin(self, session: str, instruction: str, reset: str = "", weights: str = "") -> None:
         """Begin to record a session, and end its previous episode.
 
-        Args:
-            session: The session's id.
-            instruction: The episode's instruction.
-            reset: The options of the reset, as text; empty if unknown.
-            weights: The checkpoint and weights that act, as text; empty if unknown.
+        The options of the `reset`, and the checkpoint and `weights` that act, are texts; empty if unknown.
         """
         self.end(session)
         if len(self._running) >= _SESSIONS:

@@ -101,9 +101,7 @@ class LiveObserver(Observer):
         self, observers: Observers, commands: CommandBoard | None = None, clock: Callable[[], float] = time.monotonic
     ) -> None:
         """Create an inactive observer, which `renew` adds to `observers`; `commands` are sent in the answers."""
-        self._observers = observers
-        self._commands = commands
-        self._clock = clock
+        self._observers, self._commands, self._clock = observers, commands, clock
         self._until = float("-inf")  # end of the lease, s
         self._active = False
         self._numbers = itertools.count(1)
@@ -219,23 +217,14 @@ def _answer(number: int, pending: PendingRequest, reply: Reply) -> Answer:
 
 def _info(info: Mapping[str, Any]) -> dict[str, Any]:
     """Return the entries of an act's info that are numbers or texts; texts are truncated."""
-    kept: dict[str, Any] = {}
-    for name, stated in info.items():
-        if len(kept) == _INFO:
-            break
-        if name in _OWN:
-            continue
-        value = stated.item() if isinstance(stated, np.generic) else stated
-        if isinstance(value, str):
-            kept[name[:TEXT]] = value[:TEXT]
-        elif isinstance(value, (float, bool)) or _is_number(value):
-            kept[name[:TEXT]] = value
-    return kept
-
-
-def _is_number(value: object) -> bool:
-    """Return whether the value is a number of bounded size other than NaN."""
-    return type(value) in (int, float) and -_MOST <= value <= _MOST  # type: ignore[operator]
+    stated = ((name[:TEXT], value) for name, value in info.items() if name not in _OWN)
+    plain = ((name, value.item() if isinstance(value, np.generic) else value) for name, value in stated)
+    shown = (
+        (name, value[:TEXT] if isinstance(value, str) else value)
+        for name, value in plain
+        if isinstance(value, (str, float)) or (isinstance(value, int) and -_MOST <= value <= _MOST)
+    )
+    return dict(itertools.islice(shown, _INFO))
 
 
 def _owner(image: np.ndarray) -> tuple[object, int]:

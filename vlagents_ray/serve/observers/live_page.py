@@ -48,7 +48,7 @@ from vlagents_ray.serve.access.api_keys import Caller, Keys, ScopeCheck, caller_
 from vlagents_ray.serve.access.audit import log_pressed
 from vlagents_ray.serve.access.origin_check import require_same_origin
 from vlagents_ray.serve.endpoints.access_middleware import LIVE_PAGE, AccessMiddleware
-from vlagents_ray.serve.endpoints.http_messages import deny, html_response, problem_response, request_id
+from vlagents_ray.serve.endpoints.http_messages import answer_error, deny, html_response
 from vlagents_ray.serve.observers.live_view import Fleet, Viewer
 
 PATH = "/v1/live"
@@ -95,8 +95,7 @@ class _LiveEndpoint:
         self._watching = 0
 
     async def show(self, http: HttpRequest) -> Response:
-        if (refused := self._refused(http)) is not None:
-            return refused
+        self._require_watch(http)
         viewer = self._fleet.add()
         try:
             document, _ = await viewer.next()
@@ -105,28 +104,21 @@ class _LiveEndpoint:
             self._fleet.remove(viewer)
 
     async def video(self, http: HttpRequest) -> Response:
-        if (refused := self._refused(http)) is not None:
-            return refused
+        self._require_watch(http)
         path = None if self._videos is None else self._videos(http.path_params["number"])
         return Response(status_code=404) if path is None else FileResponse(path, media_type="video/mp4")
 
-    def _refused(self, http: HttpRequest) -> Response | None:
-        try:
-            require_same_origin(http.headers)
-            self._scopes.require(_WATCH)
-        except VLAgentsError as error:
-            return problem_response(error, request_id(http))
-        return None
+    def _require_watch(self, http: HttpRequest) -> None:
+        require_same_origin(http.headers)
+        self._scopes.require(_WATCH)
 
     async def press(self, http: HttpRequest) -> Response:
+        self._scopes.require(_OPERATE)
         try:
-            self._scopes.require(_OPERATE)
             command, by = await _command(http), caller_name()
-            pressed = await self._fleet.press(command.session, command.do, by)
         except ClientDisconnect:
             return Response(status_code=499)
-        except VLAgentsError as error:
-            return problem_response(error, request_id(http))
+        pressed = await self._fleet.press(command.session, command.do, by)
         log_pressed(by, f"{command.do!r} for session {command.session!r}")
         return JSONResponse(pressed)
 
@@ -260,7 +252,8 @@ def page_server(
         raise ConfigError(
             f"live page: cannot listen on {host}:{port} ({error.strerror}); choose another port"
         ) from error
-    app = AccessMiddleware(Starlette(routes=live_routes(fleet, open_to_network=False, videos=videos)), keys, name)
+    routes, handlers = live_routes(fleet, open_to_network=False, videos=videos), {VLAgentsError: answer_error}
+    app = AccessMiddleware(Starlette(routes=routes, exception_handlers=handlers), keys, name)
     config = uvicorn.Config(
         app, log_config=None, lifespan="off", ws="websockets-sansio", timeout_graceful_shutdown=_END_S
     )
@@ -270,7 +263,7 @@ def page_server(
     try:
         yield f"http://{f'[{host}]' if ':' in host else host}:{listening.getsockname()[1]}{LIVE_PAGE}"
     finally:
-        if fleet.watched:
+        if fleet.viewers:
             time.sleep(_LAST_S)
         server.should_exit = True
         thread.join(_LEAVE_S)  # it may be waiting for a lost Ray

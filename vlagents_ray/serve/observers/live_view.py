@@ -11,7 +11,6 @@ import time
 from collections import Counter, deque
 from collections.abc import Awaitable, Callable, Collection, Mapping
 from dataclasses import dataclass, field
-from functools import partial
 from typing import Any, Protocol
 
 import numpy as np
@@ -22,18 +21,9 @@ from vlagents_ray.protocol.json_messages import plain_values
 from vlagents_ray.serve.config.deployment import LiveArgs
 from vlagents_ray.serve.engine.engine import Engine
 from vlagents_ray.serve.engine.metrics_buffer import SAMPLE, STAGES
-from vlagents_ray.serve.engine.observer import Observers
 from vlagents_ray.serve.models.loaded_model import LoadedModel
+from vlagents_ray.serve.observers import live
 from vlagents_ray.serve.observers.commands import TRACKED_S, CommandBoard
-from vlagents_ray.serve.observers.live import (
-    ENCODING_SHARE,
-    RATE,
-    SHOWN_OPS,
-    VALUES,
-    Answer,
-    KeptObservation,
-    LiveObserver,
-)
 from vlagents_ray.serve.observers.ring import Ring
 from vlagents_ray.serve.periodic import each_half_second
 from vlagents_ray.serve.queue.batch_queue import LoadMeter
@@ -64,27 +54,20 @@ class ReplicaView:
     def __init__(
         self,
         engine: Engine,
-        observers: Observers,
         name: str,
         node: str,
         metadata: Callable[[], Mapping[str, Any]],
         settings: LiveArgs | None = None,
     ) -> None:
-        """Create the view of a replica.
+        """Create the view of a replica, `name` on `node`; `metadata` returns the metadata of its policy.
 
-        Args:
-            engine: The engine of the replica.
-            observers: The engine's observers.
-            name: The name of the replica.
-            node: The name of its node.
-            metadata: Returns the metadata of the policy.
-            settings: Settings for keeping the last seconds of each session, from `open` on; None keeps none.
+        `settings` are for keeping the last seconds of each session, from `open` on; None keeps none.
         """
         self._engine = engine
         self._about = {"name": name, "node": node, "ring_s": None if settings is None else settings.ring_s}
         self._metadata = metadata
         self.commands = CommandBoard(engine.sessions, self._save)
-        self.live = LiveObserver(observers, self.commands)
+        self.live = live.LiveObserver(engine.observers, self.commands)
         self.ring = None if settings is None else Ring(self.live, engine.sessions, settings, name)
         self._meter = LoadMeter(engine.queue)
         self._slow: dict[str, Any] = {}
@@ -122,26 +105,26 @@ class ReplicaView:
 
         This may take milliseconds, too long for an event loop or the policy's thread.
         """
-        engine, live = self._engine, self.live
-        live.renew()
-        answers = live.answers(since)
+        engine = self._engine
+        self.live.renew()
+        answers = self.live.answers(since)
         snapshot = Snapshot(answers[-1].number if answers else since, {})
-        last = {one.session: one for one in answers if one.op in SHOWN_OPS}
+        last = {one.session: one for one in answers if one.op in live.SHOWN_OPS}
         ids = engine.sessions.ids()
-        live.forget_others(ids)
+        self.live.forget_others(ids)
         self.commands.forget_others(ids)
         held = sorted(engine.sessions.all(), key=lambda one: one.id)[:_SESSIONS]
         sessions = {one.id: _session(one, last.get(one.id)) for one in held}
         begun = time.thread_time()
         self._pictured = {name: self._pictured.get(name, 0) for name in sessions}
         for name in sorted(sessions, key=self._pictured.__getitem__):  # the session first whose pictures are the oldest
-            kept, described = live.observation(name), sessions[name]
+            kept, described = self.live.observation(name), sessions[name]
             described["commands"] = self.commands.of(name)
             if kept is None or kept.number <= since:
                 continue
             snapshot.number = max(snapshot.number, kept.number)
-            described["state"] = {part: _numbers(values[:VALUES]) for part, values in kept.state.items()}
-            if name in shown and time.thread_time() - begun < ENCODING_SHARE / RATE:
+            described["state"] = {part: _numbers(values[: live.VALUES]) for part, values in kept.state.items()}
+            if name in shown and time.thread_time() - begun < live.ENCODING_SHARE / live.RATE:
                 described["pictures"] = _pictures(kept, snapshot.files)
                 if described["pictures"]:
                     self._pictured[name] = kept.number
@@ -184,7 +167,7 @@ class ReplicaView:
         return self._slow
 
 
-def _session(session: Session[LoadedModel], last: Answer | None) -> dict[str, Any]:
+def _session(session: Session[LoadedModel], last: live.Answer | None) -> dict[str, Any]:
     """Describe a session for viewers, with its last answer if that is new."""
     weights = session.weights
     described = {
@@ -199,7 +182,7 @@ def _session(session: Session[LoadedModel], last: Answer | None) -> dict[str, An
     return described if last is None else described | {"rank": last.rank, "last": _act(last)}
 
 
-def _pictures(kept: KeptObservation, files: list[bytes]) -> dict[str, int]:
+def _pictures(kept: live.KeptObservation, files: list[bytes]) -> dict[str, int]:
     """Add the pictures of an observation to `files`, encoding raw pixels; return their indices."""
     found = kept.pictures()
     if sum(map(len, files)) + sum(map(len, found.values())) > PICTURES:
@@ -208,8 +191,7 @@ def _pictures(kept: KeptObservation, files: list[bytes]) -> dict[str, int]:
     return dict(zip(found, range(len(files) - len(found), len(files)), strict=True))
 
 
-def _act(answer: Answer) -> dict[str, Any]:
-    """Describe an answer for viewers."""
+def _act(answer: live.Answer) -> dict[str, Any]:
     ms = {name: round(value, 3) for name, value in answer.timing.items()}
     found: dict[str, Any] = {"n": answer.number, "op": answer.op, "ms": ms}
     if answer.error:
@@ -226,7 +208,7 @@ def _numbers(values: np.ndarray) -> list[Any]:
     return found
 
 
-def _counted(answers: list[Answer]) -> dict[str, Any]:
+def _counted(answers: list[live.Answer]) -> dict[str, Any]:
     """Return the numbers of acts and errors among the answers, the batch sizes of the acts, and their times, ms."""
     acts = [one.timing for one in answers if one.op == "act" and not one.error]
     sample = acts[:: max(1, len(acts) // SAMPLE)]
@@ -247,11 +229,9 @@ class OtherReplicas(Protocol):
 
     async def views(self) -> dict[str, SnapshotReader]:
         """Return the readers of the replicas' snapshots, by name."""
-        ...
 
     async def press(self, session: str, do: str, by: str) -> dict[str, Any] | None:
         """Give a command to a session, see `CommandBoard.press`; return None if no replica has the session."""
-        ...
 
 
 class Viewer:
@@ -302,30 +282,23 @@ class Fleet:
 
         `more` returns further entries of the document; if nothing has changed, it returns the same object as before.
         """
-        self._own = own
-        self._others = others
-        self._more = more
-        self._viewers: set[Viewer] = set()
+        self._own, self._others, self._more = own, others, more
+        self.viewers: set[Viewer] = set()
         self._gathering: asyncio.Task[None] | None = None
         self._read: dict[str, int] = {}  # number of the last snapshot, by replica; "" is this one
-
-    @property
-    def watched(self) -> bool:
-        """Whether there are viewers."""
-        return bool(self._viewers)
 
     def add(self) -> Viewer:
         """Add a viewer, and gather snapshots for it from now on."""
         viewer = Viewer()
-        self._viewers.add(viewer)
+        self.viewers.add(viewer)
         if self._gathering is None:
             self._gathering = asyncio.ensure_future(self._gather())
         return viewer
 
     def remove(self, viewer: Viewer) -> None:
         """Remove a viewer; without viewers nothing is gathered."""
-        self._viewers.discard(viewer)
-        if not self._viewers and self._gathering is not None:
+        self.viewers.discard(viewer)
+        if not self.viewers and self._gathering is not None:
             self._gathering.cancel()
             self._gathering = None
 
@@ -347,27 +320,23 @@ class Fleet:
             except Exception:
                 logger.exception("the live view was not read; tried again")
             else:
-                for viewer in self._viewers:
+                for viewer in self.viewers:
                     viewer.put(snapshots, more)
-            await asyncio.sleep(max(1 / RATE / 2, 1 / RATE - (time.monotonic() - begun)))
+            await asyncio.sleep(max(1 / live.RATE / 2, 1 / live.RATE - (time.monotonic() - begun)))
 
     async def _snapshots(self) -> list[Snapshot]:
-        shown = frozenset[str]().union(*(viewer.shown for viewer in self._viewers))
+        shown = frozenset[str]().union(*(viewer.shown for viewer in self.viewers))
         readers: dict[str, SnapshotReader] = {} if self._others is None else dict(await self._others.views())
-        if self._own is not None:
-            readers[""] = partial(_read_own, self._own)
+        if (own := self._own) is not None:
+            readers[""] = lambda since, shown: asyncio.to_thread(own.read, since, shown)
         results = await asyncio.gather(
             *(read(self._read.get(name, 0), shown) for name, read in readers.items()), return_exceptions=True
         )
         found = {name: one for name, one in zip(readers, results, strict=True) if isinstance(one, Snapshot)}
         self._read = {name: found[name].number if name in found else self._read.get(name, 0) for name in readers}
-        if self._own is not None and isinstance(error := results[-1], BaseException):
+        if own is not None and isinstance(error := results[-1], BaseException):
             raise error
         return list(found.values())
-
-
-async def _read_own(own: ReplicaView, since: int, shown: Collection[str]) -> Snapshot:
-    return await asyncio.to_thread(own.read, since, shown)
 
 
 def _with_files(snapshot: Snapshot, files: list[bytes], shown: Collection[str]) -> dict[str, Any]:

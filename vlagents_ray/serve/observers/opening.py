@@ -4,8 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from contextlib import ExitStack
-from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 from vlagents_ray import tracing
 from vlagents_ray.serve.config.deployment import ServerArgs
@@ -16,17 +15,12 @@ from vlagents_ray.serve.observers.recording import SessionRecorder, open_recorde
 from vlagents_ray.serve.observers.spans import RequestSpans
 
 
-@dataclass(frozen=True, slots=True)
-class ReplicaObservers:
-    """The open observers of one replica, until `close`."""
+class ReplicaObservers(NamedTuple):
+    """The open observers of one replica."""
 
     view: ReplicaView  # the data for viewers; the live observer is active only while it is read
     recorder: SessionRecorder | None
-    _opened: ExitStack
-
-    def close(self) -> None:
-        """Close the observers in reverse order; they write the data that they have kept, which may take seconds."""
-        self._opened.close()
+    close: Callable[[], None]  # closes them in reverse order; they write the data that they have kept, for seconds
 
 
 def open_observers(
@@ -50,7 +44,7 @@ def open_observers(
             opened.callback(observers.remove, observer)
             observers.add(observer)
 
-        view = ReplicaView(engine, observers, name, node, metadata, args.live)
+        view = ReplicaView(engine, name, node, metadata, args.live)
         view.open()
         opened.callback(view.close)
         if (tracer := tracing.tracer()) is not None:
@@ -58,4 +52,4 @@ def open_observers(
         recorder = None
         if args.record is not None:
             observe(recorder := open_recorder(engine.sessions, args.record, replica, metadata))
-        return ReplicaObservers(view, recorder, opened.pop_all())
+        return ReplicaObservers(view, recorder, opened.pop_all().close)

@@ -114,26 +114,12 @@ class _Recorded:
 class SessionRecorder(Observer):
     """Records a share of the sessions of one replica until `close`."""
 
-    def __init__(
-        self,
-        writer: EpisodeWriter,
-        sessions: SessionTable[LoadedModel],
-        *,
-        share: float = 1.0,
-        held_bytes: int = _HELD_BYTES,
-    ) -> None:
-        """Create a recorder, and start its threads.
-
-        Args:
-            share: Share of the episodes to record, drawn at each reset, in [0, 1].
-            held_bytes: Maximum size of the requests that wait to be written.
-        """
+    def __init__(self, writer: EpisodeWriter, sessions: SessionTable[LoadedModel], *, share: float = 1.0) -> None:
+        """Create a recorder, and start its threads; `share` of the episodes, in [0, 1], is drawn at each reset."""
         self.dropped = 0  # number of acts that exceeded the memory, or whose episode could not be written
         self.ended: str | None = None  # reason why nothing more is recorded
-        self._writer = writer
-        self._sessions = sessions
-        self._share = share
-        self._held_bytes = held_bytes
+        self._writer, self._sessions = writer, sessions
+        self._share, self._held_bytes = share, _HELD_BYTES
         self._held = 0
         self._lock = threading.RLock()  # guards `_held`, which the garbage collector may reduce at any time
         self._looking = False  # whether a comparison of the current sessions with `_first` is scheduled
@@ -171,8 +157,7 @@ class SessionRecorder(Observer):
 
     def on_answer(self, pending: PendingRequest, reply: Reply) -> None:
         """Record the frame of the answered request."""
-        recorded = pending.kept.pop(self, None)
-        if recorded is not None and reply.error is None:
+        if (recorded := pending.kept.pop(self, None)) is not None and reply.error is None:
             self._write_later(partial(self._handle, recorded, reply))
 
     def close(self) -> None:
@@ -180,7 +165,7 @@ class SessionRecorder(Observer):
         each_half_second.remove(self._look)
         until = time.monotonic() + _CLOSING_S
         self._copier.close(_CLOSING_S)
-        self._worker.put(self._complete)
+        self._worker.put(partial(self._write, self._writer.close))
         self._worker.close(max(0.0, until - time.monotonic()))
 
     def count_held(self, size: int) -> None:
@@ -213,16 +198,8 @@ class SessionRecorder(Observer):
         try:
             write()
         except (OSError, RecordingEnded) as error:
-            self._end(error)
-
-    def _end(self, error: Exception) -> None:
-        """End the recording, without ending any session."""
-        self.ended = str(error)
-        logger.error("recording has ended, and the sessions go on: %s", error)
-        self._writer.close()
-
-    def _complete(self) -> None:
-        if self.ended is None:
+            self.ended = str(error)
+            logger.error("recording has ended, and the sessions go on: %s", error)  # noqa: TRY400 - it says why
             self._writer.close()
 
     def _handle(self, recorded: _Recorded, reply: Reply) -> None:
@@ -308,8 +285,7 @@ def open_recorder(
 
 
 def _frame(recorded: _Recorded, obs: Obs, reply: Reply, first: int) -> RecordedAct:
-    act = reply.act
-    if act is None:
+    if (act := reply.act) is None:
         raise PolicyFailed("the answer has no action")
     info = {key: value for key, value in act.info.items() if key != "timing"}
     version = info.get(POLICY) or {}

@@ -42,9 +42,7 @@ class Ring:
         for module in ("av", "pyarrow"):
             require(module)
         self.bytes = 0  # size of the held frames
-        self._live = live
-        self._sessions = sessions
-        self._settings = settings
+        self._live, self._sessions, self._settings = live, sessions, settings
         folder, most_bytes = Path(settings.folder), settings.most_gb * 1e9
         self._writer = EpisodeWriter(folder, name, RATE, lossless=False, most_bytes=most_bytes)
         self._frames: dict[str, deque[KeptObservation]] = {}  # by session

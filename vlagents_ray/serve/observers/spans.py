@@ -5,7 +5,6 @@ from __future__ import annotations
 import time
 from collections import deque
 from collections.abc import Mapping
-from types import MappingProxyType
 from typing import Any, NamedTuple
 
 from vlagents_ray import tracing
@@ -29,9 +28,9 @@ class _ServedRequest(NamedTuple):
     rank: str
     traceparent: str
     decoded_ns: int  # time at which the request was decoded, ns since 1970
-    timing: Mapping[str, float] = MappingProxyType({})  # ms by stage; completed when the answer was sent
-    error: str = ""
-    answered_ns: int = 0
+    timing: Mapping[str, float]  # ms by stage; completed when the answer was sent
+    error: str
+    answered_ns: int
 
 
 class RequestSpans(Observer):
@@ -39,8 +38,7 @@ class RequestSpans(Observer):
 
     def __init__(self, tracer: Any, replica: str) -> None:
         """Trace requests with `tracer`, under the replica's name."""
-        self._tracer = tracer
-        self._replica = replica
+        self._tracer, self._replica = tracer, replica
         self._answered: deque[_ServedRequest] = deque(maxlen=_KEPT)
         self._trace = require("opentelemetry.trace", extra="otel")
         module = require("opentelemetry.trace.propagation.tracecontext", extra="otel")
@@ -55,21 +53,16 @@ class RequestSpans(Observer):
 
     def on_request(self, pending: PendingRequest) -> None:
         """Store the start of the request."""
-        request = pending.request
-        if request.op in _OPS:
-            session, parent = pending.session_id, _traceparent(request)
-            pending.kept[self] = _ServedRequest(session, request.op, request.rank, parent, time.time_ns())
+        if pending.request.op in _OPS:
+            pending.kept[self] = _traceparent(pending.request), time.time_ns()
 
     def on_answer(self, pending: PendingRequest, reply: Reply) -> None:
         """Export the span of the answered request."""
-        served: _ServedRequest | None = pending.kept.pop(self, None)
-        if served is not None:
+        begun: tuple[str, int] | None = pending.kept.pop(self, None)
+        if begun is not None:
+            about = pending.session_id, pending.request.op, pending.rank.name.lower()
             error = "" if reply.error is None else f"{reply.error.code}: {reply.error}"[:_TEXT]
-            self._answered.append(
-                served._replace(
-                    rank=pending.rank.name.lower(), timing=reply.timing, error=error, answered_ns=time.time_ns()
-                )
-            )
+            self._answered.append(_ServedRequest(*about, *begun, reply.timing, error, time.time_ns()))
 
     def export(self) -> None:
         """Create the spans of the answers since the last call, whose timing is complete by now."""

@@ -63,9 +63,7 @@ class Child:
         self.continues_plans = False  # whether the policy's chunks continue a plan, set by `start`
         self.trained: dict[str, Any] = {}  # the values that a learner trains, set by `start`: see `child_main`
         self.sessions: set[str] = set()  # names of the sessions in the child
-        self._python = python
-        self._settings = settings
-        self._env_vars = env_vars
+        self._python, self._settings, self._env_vars = python, settings, env_vars
         self._process: subprocess.Popen[bytes] | None = None
         self._spawned: queue.SimpleQueue[subprocess.Popen[bytes] | OSError] = queue.SimpleQueue()
         self._last_words: deque[str] = deque(maxlen=_LAST_WORDS)
@@ -128,12 +126,8 @@ class Child:
         self.sessions.add(name)
         return name
 
-    def close_session(self, name: str) -> None:
-        """Close a session soon; return at once, as the garbage collector may call this at any moment."""
-        self._left.put(name)
-
-    def forget_weights(self, name: int) -> None:
-        """Drop a version of the weights soon, as `close_session` does."""
+    def drop(self, name: str | int) -> None:
+        """Close a session, or drop a version of the weights, soon; the garbage collector may call this at any time."""
         self._left.put(name)
 
     def call_for_weights(self, **call: Any) -> dict[str, Any]:
@@ -159,8 +153,7 @@ class Child:
 
     def close(self) -> None:
         """Close the policy, and end the process."""
-        process = self._process
-        if process is None or self._closed:
+        if (process := self._process) is None or self._closed:
             return
         self._closed = True
         self._left.put(None)
@@ -340,7 +333,7 @@ class ChildAgent(Agent, HoldsWeights):
 
     def __del__(self) -> None:
         if (session := getattr(self, "_session", None)) is not None:
-            self._child.close_session(session)
+            self._child.drop(session)
 
 
 class ChildWeights(ModelWeights):
@@ -404,7 +397,7 @@ class ChildWeights(ModelWeights):
 
     def _name(self, version: WeightsVersion, name: int) -> None:
         self._names[version] = name
-        finalize(version, self._child.forget_weights, name).atexit = False
+        finalize(version, self._child.drop, name).atexit = False
 
 
 def _memory() -> BinaryIO:

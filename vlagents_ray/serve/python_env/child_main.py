@@ -146,8 +146,7 @@ def _line() -> bytes:
     """Read the first line of the standard input, and no byte after it."""
     line = b""
     while not line.endswith(b"\n"):
-        byte = os.read(0, 1)
-        if not byte:
+        if not (byte := os.read(0, 1)):
             sys.exit(1)
         line += byte
     return line

@@ -265,8 +265,7 @@ def _uv(arguments: Sequence[str]) -> str:
         command = [sys.executable, "-m", "uv"]
     else:
         beside = f"{Path(sys.executable).parent}{os.pathsep}{os.environ.get('PATH', '')}"
-        binary = shutil.which("uv", path=beside)
-        if binary is None:
+        if (binary := shutil.which("uv", path=beside)) is None:
             raise MissingDependency("'uv' is not installed; pip install 'vlagents-ray[serve]'")
         command = [binary]
     done = subprocess.run(  # noqa: S603 - uv, as installed with this package

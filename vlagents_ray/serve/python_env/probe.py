@@ -43,7 +43,6 @@ print("VLA" + json.dumps(found))
 class EnvironmentProbe:
     """The answer of an interpreter."""
 
-    python: str  # path of the interpreter
     versions: dict[str, str]  # versions of "python", "ray", "numpy" and "vlagents-ray", as far as they are installed
     policy: dict[str, Any] | None = None  # result of `child_main.examine`, if it was requested
 
@@ -76,10 +75,27 @@ def probe(
         cure = f"did you mean {inside}?" if inside.is_file() else f"make one with `{_making(python)}`"
         raise ConfigError(f"environment.python: no such file, got {python!r}, want an interpreter; {cure}")
     version = importlib.metadata.version("vlagents-ray")
-    settings = {"policy": policy, "version": version}
-    said = _run_probe(python, json.dumps(settings), env_vars or {})
+    try:
+        done = subprocess.run(  # noqa: S603 - the deployment's own interpreter
+            [python, "-c", _PROBE, *_PACKAGES],
+            # Not as an argument, which every user of the machine could read.
+            input=json.dumps({"policy": policy, "version": version}),
+            capture_output=True,
+            text=True,
+            timeout=_TIMEOUT_S,
+            check=False,
+            env={**os.environ, **(env_vars or {})},
+        )
+    except (OSError, subprocess.TimeoutExpired) as error:
+        raise ConfigError(
+            f"environment.python: {python!r} is no Python interpreter that runs here ({error})"
+        ) from error
+    last = done.stdout.strip().rpartition("\n")[2]
+    if not last.startswith("VLA{"):
+        words = (done.stderr or done.stdout).strip()[-500:] or "it said nothing"
+        raise ConfigError(f"environment.python: {python!r} is no Python interpreter, or a broken one: {words}")
+    said: dict[str, Any] = json.loads(last[3:])
     examined = said.pop("policy", None)
-    found = EnvironmentProbe(python, said, examined)
     if _minor(said["python"]) < OLDEST:
         oldest = ".".join(map(str, OLDEST))
         raise ConfigError(f"environment.python: {python} is Python {said['python']}, want {oldest} or newer")
@@ -89,7 +105,7 @@ def probe(
             f"environment.python: {python} has {f'vlagents-ray {theirs}' if theirs else 'no vlagents-ray'}, want "
             f"{version} as here; install it there, or make the environment with `{_making(python)}`"
         )
-    return found
+    return EnvironmentProbe(said, examined)
 
 
 def _making(python: str) -> str:
@@ -145,26 +161,3 @@ def _process(environment: EnvironmentArgs, found: EnvironmentProbe) -> Literal["
 
 def _minor(version: str) -> tuple[int, ...]:
     return tuple(map(int, version.split(".")[:2]))
-
-
-def _run_probe(python: str, settings: str, env_vars: Mapping[str, str]) -> dict[str, Any]:
-    try:
-        done = subprocess.run(  # noqa: S603 - the deployment's own interpreter
-            [python, "-c", _PROBE, *_PACKAGES],
-            input=settings,  # not as an argument, which every user of the machine could read
-            capture_output=True,
-            text=True,
-            timeout=_TIMEOUT_S,
-            check=False,
-            env={**os.environ, **env_vars},
-        )
-    except (OSError, subprocess.TimeoutExpired) as error:
-        raise ConfigError(
-            f"environment.python: {python!r} is no Python interpreter that runs here ({error})"
-        ) from error
-    last = done.stdout.strip().rpartition("\n")[2]
-    if not last.startswith("VLA{"):
-        words = (done.stderr or done.stdout).strip()[-500:] or "it said nothing"
-        raise ConfigError(f"environment.python: {python!r} is no Python interpreter, or a broken one: {words}")
-    answer: dict[str, Any] = json.loads(last[3:])
-    return answer

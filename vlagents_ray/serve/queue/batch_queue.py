@@ -37,8 +37,8 @@ class Taken(NamedTuple):
 class BatchQueue:
     """The waiting requests, and the watched files that deliver new ones.
 
-    One thread, the policy's, calls `bind`, then in turns `next`, `begin` and `end`, and at last `release`. It waits on
-    file descriptors, so that a local client's socket can be one of them: its request then reaches the policy without a
+    One thread, the policy's, calls `bind`, then in turns `next`, `begin` and `end`, at last `poller.close`. It waits on
+    file descriptors, so that a local client's socket can be one: its request then reaches the policy without a
     thread switch. While batches take milliseconds and are not all for one session, a second thread polls these files,
     so that the next batch is already decoded when the current one ends.
 
@@ -60,8 +60,7 @@ class BatchQueue:
         clock: Callable[[], float] = time.perf_counter,
         poller: Poller | None = None,
     ) -> None:
-        self._clock = clock
-        self._idle_s = idle_s
+        self._clock, self._idle_s = clock, idle_s
         self.largest = max_batch_size
         self._waiting = FairQueue()
         self._load_timer = LoadTimer()  # counts the time until the policy is loaded as idle
@@ -163,14 +162,13 @@ class BatchQueue:
         """Return the number of requests that wait for the next batch, by class."""
         return dict(zip(Rank, self._waiting.depth, strict=True))
 
-    def waited_s(self) -> float:
-        """Return the total time that all requests have waited so far, s; its growth rate is the mean queue length."""
-        with self._lock:
-            return self._load_timer.waited_s(self._waiting.size)
+    def load_s(self) -> tuple[float, float]:
+        """Return the total time for which the policy's thread has been idle, and all requests have waited so far, s.
 
-    def idle_time_s(self) -> float:
-        """Return the total time for which the policy's thread has been idle, s; otherwise it was busy."""
-        return self._load_timer.idle_time_s()
+        The growth rate of the latter is the mean queue length.
+        """
+        with self._lock:
+            return self._load_timer.idle_time_s(), self._load_timer.waited_s(self._waiting.size)
 
     def close(self) -> list[PendingRequest]:
         """Refuse further requests, make `next` return None after the running batch, and return the waiting requests."""
@@ -180,10 +178,6 @@ class BatchQueue:
             self._wait_over.set()
             self._wake()
             return self._waiting.clear()
-
-    def release(self) -> None:
-        """Close the poller, when no thread takes batches any more."""
-        self.poller.close()
 
     def _wake(self) -> None:
         if self._asleep and threading.get_ident() != self._thread:  # if the policy's thread calls this, it is awake
@@ -291,11 +285,11 @@ class LoadMeter:
 
     def __init__(self, queue: BatchQueue) -> None:
         self._queue = queue
-        self._last = (time.perf_counter(), queue.idle_time_s(), queue.waited_s())
+        self._last = (time.perf_counter(), *queue.load_s())
 
     def read(self) -> QueueLoad:
         """Return the mean load since the last call, or since the meter was created."""
-        now = (time.perf_counter(), self._queue.idle_time_s(), self._queue.waited_s())
+        now = (time.perf_counter(), *self._queue.load_s())
         elapsed, idle, waited = (b - a for a, b in zip(self._last, now, strict=True))
         self._last = now
         if elapsed <= 0:

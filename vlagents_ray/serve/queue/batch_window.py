@@ -80,9 +80,7 @@ class BatchWindow:
     """
 
     def __init__(self, patience: float, size: int, is_open: Callable[[str], bool]) -> None:
-        self._patience = patience
-        self._size = size
-        self._is_open = is_open
+        self._patience, self._size, self._is_open = patience, size, is_open
         self._no_batch = _AnsweredBatch(())
         self._last = self._previous = self._no_batch
         self._duration = 0.0  # duration of the last batch, s

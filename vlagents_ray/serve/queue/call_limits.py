@@ -39,8 +39,7 @@ class PolicyCall:
     __slots__ = ("_calls", "_count", "_longest_s", "_process", "_thread", "began", "ended", "op")
 
     def __init__(self, calls: PolicyCalls, op: str) -> None:
-        self.op = op
-        self._calls = calls
+        self.op, self._calls = op, calls
         self.began = self.ended = 0.0  # times of the last call, s of `PolicyCalls.clock`; for the calling thread only
         self._thread = self._process = 0
         self._count = 0
@@ -123,9 +122,10 @@ class PolicyCalls:
     def require_device(self) -> None:
         """Raise `PolicyUnavailable` if the accelerator failed, so that clients begin again at another replica."""
         if self.broken is not None:
+            error = f"{type(self.broken).__name__}: {str(self.broken).partition(chr(10))[0]}"
             raise PolicyUnavailable(
-                f"the policy's accelerator failed ({_line(self.broken)}); this replica is replaced, and the session "
-                f"begins again at another one"
+                f"the policy's accelerator failed ({error}); this replica is replaced, and the session begins again at "
+                f"another one"
             ) from self.broken
 
     def check_health(self) -> None:
@@ -137,7 +137,3 @@ class PolicyCalls:
     def overdue(self) -> PolicyCall | None:
         """Return a running call that has exceeded its limit, or None."""
         return next((call for call in tuple(self.under_way) if call.lasted_s > call.limit_s), None)
-
-
-def _line(error: BaseException) -> str:
-    return f"{type(error).__name__}: {str(error).partition(chr(10))[0]}"

@@ -31,8 +31,7 @@ class _ClassQueue:
 
     def add(self, queue: _SessionQueue) -> None:
         source = queue[0].origin.connection or queue[0].session_id
-        queues = self.queues.get(source)
-        if queues is None:
+        if (queues := self.queues.get(source)) is None:
             self.queues[source] = deque((queue,))
             self.sources.append(source)
         else:
@@ -96,8 +95,7 @@ class FairQueue:
             self._append(lone)
 
     def _append(self, pending: PendingRequest) -> None:
-        queue = self._sessions.get(pending.session_id)
-        if queue is not None:
+        if (queue := self._sessions.get(pending.session_id)) is not None:
             queue.append(pending)
             return
         queue = self._sessions[pending.session_id] = deque((pending,))

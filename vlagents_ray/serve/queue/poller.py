@@ -135,8 +135,7 @@ class Poller:
         for descriptor, _ in events:
             if lent and not self._lent.is_set():
                 return  # the epoll is level-triggered: the owner's next poll reports the remaining events
-            ready = self._ready.get(descriptor)
-            if ready is None:
+            if (ready := self._ready.get(descriptor)) is None:
                 continue  # an earlier callback of this loop has stopped watching it
             try:
                 ready()

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
-from typing import Any
+from typing import Any, NamedTuple
 
 from vlagents_ray.images import thread_map
 from vlagents_ray.interface import Agent, Obs
@@ -16,27 +16,12 @@ from vlagents_ray.interface import Agent, Obs
 _THREADS = 4  # maximum number of threads; images are resized without Python's lock
 
 
-class Preparation:
+class Preparation(NamedTuple):
     """The call of `Agent.prepare` for one observation."""
 
-    __slots__ = ("_agent", "_future", "_obs")
-
-    def __init__(self, agent: Agent, obs: Obs, threads: ThreadPoolExecutor) -> None:
-        self._agent, self._obs = agent, obs
-        self._future: Future[Any] = threads.submit(agent.prepare, obs)
-
-    def cancel(self) -> bool:
-        """Cancel the preparation unless it has begun; return whether it was canceled."""
-        return self._future.cancel()
-
-    def finish(self, agent: Agent | None, *, begun: bool) -> None:
-        """Set the result if `agent` is still the session's: wait for it if it has `begun`, otherwise compute it here.
-
-        Raises:
-            Exception: Any error of the agent's `prepare`.
-        """
-        if agent is self._agent:  # otherwise the session has been reset
-            self._obs.prepared = self._future.result() if begun else self._agent.prepare(self._obs)
+    agent: Agent
+    obs: Obs
+    future: Future[Any]
 
 
 class Preparations:
@@ -50,7 +35,7 @@ class Preparations:
         if agent is None or obs is None or type(agent).prepare is Agent.prepare:
             return None
         try:
-            return Preparation(agent, obs, self._threads)
+            return Preparation(agent, obs, self._threads.submit(agent.prepare, obs))
         except RuntimeError:  # the threads have ended
             return None
 
@@ -64,14 +49,17 @@ class Preparations:
 
         def finish(place: int, *, begun: bool) -> None:
             preparation, agent = preparations[place]
+            if preparation is None or agent is not preparation.agent:  # the session has been reset
+                return
+            obs, future = preparation.obs, preparation.future
             try:
-                preparation.finish(agent, begun=begun)  # type: ignore[union-attr]
+                obs.prepared = future.result() if begun else preparation.agent.prepare(obs)
             except Exception as error:  # noqa: BLE001 - fails the request of that observation
                 errors[place] = error
 
         begun = []
         for place, (preparation, _) in reversed(list(enumerate(preparations))):
-            if preparation is not None and preparation.cancel():
+            if preparation is not None and preparation.future.cancel():
                 finish(place, begun=False)
             elif preparation is not None:
                 begun.append(place)

@@ -1,1 +1,1 @@
-"""The Ray Serve deployment of a replica: its application, metadata and metrics."""
+"""The Ray Serve deployment of a replica, and its metrics."""

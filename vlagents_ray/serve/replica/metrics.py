@@ -1,30 +1,9 @@
 """Prometheus metrics of a replica, through Ray: at the metrics port of its node, with the prefix `ray_`.
 
-| series | kind | tags |
-|---|---|---|
-| `vlagents_requests` | counter | op, transport, class, code ("ok", an error's code, "disconnected") |
-| `vlagents_latency_ms` | histogram | op, transport, class; on the server, successful requests |
-| `vlagents_stage_ms` | histogram | stage (decode, queue, inference, encode), transport; successful acts |
-| `vlagents_batch_size` | histogram | observations in one forward pass |
-| `vlagents_padding_rows` | counter | rows that filled batches up to a fixed size |
-| `vlagents_queue_depth` | gauge | class; requests that wait now |
-| `vlagents_sessions` | gauge | transport; sessions that are held |
-| `vlagents_utilisation` | gauge | share of the last second in which the policy's thread was busy |
-| `vlagents_gpu_memory_bytes` | gauge | kind (allocated, reserved, free); only with a GPU in the replica's process |
-| `vlagents_gpu_ms` | histogram | forward pass on the GPU, first to last operation; as the line above |
-| `vlagents_graph_replays` | counter | replays of CUDA graphs |
-| `vlagents_policy_version` | gauge | newest version of the weights; 0 is the checkpoint that was loaded |
-| `vlagents_weight_push_ms` | histogram | from new weights at the replica that received them until all act with them |
-| `vlagents_uncompiled` | gauge | batch sizes that run without compilation, although the policy's `compile` is set |
-| `vlagents_out_of_memory` | counter | forward passes that did not fit into memory; not those in a child process |
-| `vlagents_hung_calls` | counter | op; calls of the policy that took longer than `limits` allow |
-| `vlagents_recorded_frames` | counter | outcome ("saved", "lost"); acts of sessions that `record` names |
-| `vlagents_recording` | gauge | 1 while sessions are recorded, 0 once that has ended or if `record` is not set |
-| `vlagents_keys_unreadable_s` | gauge | time since which the file of API keys cannot be read; 0 if it can |
-
-All series have the tags `application`, `deployment`, `replica` and `policy`. Transport is `shm`, `plasma`, `websocket`,
-`http` or `handle`, class is `robot` or `simulation`. Counters are exact; a histogram takes a random sample of up to 100
-values per second for each kind of request and for the batches.
+`Exporter` creates the series. All have the tags `application`, `deployment`, `replica` and `policy`. Transport is
+`shm`, `plasma`, `websocket`, `http` or `handle`, class is `robot` or `simulation`, code is "ok", an error's code or
+"disconnected". Latencies are those of successful requests, stages those of successful acts. Counters are exact; a
+histogram takes a random sample of up to 100 values per second for each kind of request and for the batches.
 """
 
 from __future__ import annotations
@@ -69,13 +48,9 @@ class Exporter:
         keys: Keys | None = None,
         recorder: SessionRecorder | None = None,
     ) -> None:
-        """Create the series.
+        """Create the series of an engine with the `tags` application, deployment, replica and policy.
 
-        Args:
-            engine: The engine.
-            tags: Their tags: application, deployment, replica, policy.
-            keys: The keys, whose file's state is exported; None if there are none.
-            recorder: The recorder, whose counts are exported; None if there is none.
+        The state of the file of the `keys` and the counts of the `recorder` are exported, if there are any.
         """
         make = partial(_series, tags)
         self._engine = engine
@@ -89,16 +64,19 @@ class Exporter:
         self._depth = make(Gauge, "queue_depth", "Requests that wait.", "class")
         self._sessions = make(Gauge, "sessions", "Sessions that are held.", "transport")
         self._utilisation = make(Gauge, "utilisation", "Busy share of the policy's thread.")
+        # Of a GPU in the replica's process, as for the next series; the kinds are allocated, reserved and free.
         self._gpu_memory = make(Gauge, "gpu_memory_bytes", "Memory of the GPU.", "kind")
         self._gpu_ms = make(Histogram, "gpu_ms", "Forward pass on the GPU.", boundaries=_MS)
         self._replays = make(Counter, "graph_replays", "Replays of CUDA graphs.")
         self._version = make(Gauge, "policy_version", "Newest version of the weights.")
         self._pushes = make(Histogram, "weight_push_ms", "Time until all replicas act with weights.", boundaries=_MS)
         self._hung = make(Counter, "hung_calls", "Calls of the policy over their time limit.", "op")
+        # Not those in a child process.
         self._out_of_memory = make(Counter, "out_of_memory", "Forward passes that did not fit into memory.")
         self._uncompiled = make(Gauge, "uncompiled", "Batch sizes that run without the compilation that is set.")
         self._unreadable = make(Gauge, "keys_unreadable_s", "Time in which the key file could not be read.")
         self._recorded = make(Counter, "recorded_frames", "Acts of recorded sessions.", "outcome")
+        # 1 while sessions are recorded, 0 once that has ended or if `record` is not set.
         self._recording = make(Gauge, "recording", "Whether sessions are recorded.")
         self._keys, self._recorder = keys, recorder
         self._replayed = 0  # exported part of the replays

@@ -30,8 +30,7 @@ from vlagents_ray.registry import names
 from vlagents_ray.serve.access.api_keys import NoKey, require_access, warn_of_plain_http
 from vlagents_ray.serve.access.audit import write_audit
 from vlagents_ray.serve.config.deployment import ServerArgs
-from vlagents_ray.serve.dialects.base import ReplicaContext
-from vlagents_ray.serve.dialects.routes import describe, dialect_routes, require_fit
+from vlagents_ray.serve.dialects.base import ReplicaContext, dialect_routes
 from vlagents_ray.serve.endpoints.access_middleware import AccessMiddleware
 from vlagents_ray.serve.endpoints.connection import Admit
 from vlagents_ray.serve.endpoints.http import build_http_app
@@ -117,9 +116,10 @@ class PolicyReplica(ClientApi, SiblingApi):
 
         # The endpoints.
         has_files = hasattr(os, "memfd_create")
-        self._local = ShmServer(self._engine, self._limits, self._admit()) if has_files else None
+        admit: Admit | NoKey = NoKey.OPEN if self._keys is None else partial(self._keys.check, app=self._app)
+        self._local = ShmServer(self._engine, self._limits, admit) if has_files else None
         self._plasma = PlasmaServer(self._engine, self._limits) if has_files else None
-        self._stream = self._stream_endpoint()
+        self._stream = _stream_endpoint(self._engine, settings, admit) if settings.stream.enabled else None
         self._opened = True
         for endpoint in (self._local, self._plasma, self._stream):
             if endpoint is not None:
@@ -143,14 +143,6 @@ class PolicyReplica(ClientApi, SiblingApi):
         if self._configured:
             return
         self._configured = True
-        await self._load_policy()
-        await self._catch_up()  # gets the other replicas' versions before this replica is ready
-        works = [self._watch_shutdown(), self._keep_catching_up(), self._rebalancer.run()]
-        if self._gateway is not None:
-            works.append(self._poll_gateways())
-        self._tasks = [asyncio.ensure_future(work) for work in works]
-
-    async def _load_policy(self) -> None:
         try:
             await asyncio.to_thread(self._engine.start)
         except PolicyFailed as error:
@@ -159,6 +151,11 @@ class PolicyReplica(ClientApi, SiblingApi):
             logger.exception("the policy did not load")
             # Errors of this package contain the remedy; without this, `serve status` would show both tracebacks first.
             raise PolicyFailed(str(error)) from None
+        await self._catch_up()  # gets the other replicas' versions before this replica is ready
+        works = [self._watch_shutdown(), self._keep_catching_up(), self._rebalancer.run()]
+        if self._gateway is not None:
+            works.append(self._poll_gateways())
+        self._tasks = [asyncio.ensure_future(work) for work in works]
 
     async def close(self) -> None:
         """Close everything: first the sources of requests, then the engine, then its observers, and last the endpoints.
@@ -203,33 +200,14 @@ class PolicyReplica(ClientApi, SiblingApi):
 
     def __serve_build_asgi_app__(self) -> ASGIApp:
         slow_s, idle_s = self._args.limits.slow_s, self._args.sessions.idle_s
-        dialects = dialect_routes(self._args.dialects, ReplicaContext(self._engine, self.metadata, self._limits))
         insecure, hosts = self._args.access.insecure, self._args.access.hosts
-        others = [
+        more = [
+            *dialect_routes(self._args.dialects, ReplicaContext(self._engine, self.metadata, self._limits)),
             *weights_routes(self, slow_s, open_to_network=insecure),
             *live_routes(self._fleet, open_to_network=insecure),
         ]
-        inside = build_http_app(self._engine, self.metadata, self._limits, self._metadata_for_machine, dialects, others)
+        inside = build_http_app(self._engine, self.metadata, self._limits, self._metadata_for_machine, more)
         return AccessMiddleware(inside, self._keys, self._app, slow_s=slow_s, idle_s=idle_s, hosts=hosts)
-
-    def _admit(self) -> Admit | NoKey:
-        """Return the check of keys at the replica's own ports, or the reason why none is needed."""
-        return NoKey.OPEN if self._keys is None else partial(self._keys.check, app=self._app)
-
-    def _stream_endpoint(self) -> WebSocketServer | None:
-        stream = self._args.stream
-        if not stream.enabled:
-            return None
-        return WebSocketServer(
-            self._engine,
-            self._limits,
-            _plain_host(),
-            stream.ports,
-            self._admit(),
-            slow_s=self._args.limits.slow_s,
-            idle_s=self._args.sessions.idle_s,
-            hosts=self._args.access.hosts,
-        )
 
     def metadata(self) -> dict[str, Any]:
         """Return the document of `GET /v1/metadata` and `RemoteAgent.metadata`."""
@@ -248,7 +226,7 @@ class PolicyReplica(ClientApi, SiblingApi):
             "version": importlib.metadata.version("vlagents-ray"),
             "code": None if self._code is None else self._code.to_json(),
             "program": self._program | models.files,
-            "dialects": describe(self._args.dialects) | self._gateways,
+            "dialects": self._args.dialects.describe() | self._gateways,
             "local": None if self._local is None else asdict(self._local.address),
             "stream": None if self._stream is None else asdict(self._stream.address),
         }
@@ -267,7 +245,7 @@ class PolicyReplica(ClientApi, SiblingApi):
             must_be_near: Whether the client's transport reaches no other machine.
         """
         place = ClientLocation(node, boot_id, must_be_near)
-        return await self._place_at_sibling(place) or self._connection_info()
+        return await self._rebalancer.place(place) or self._connection_info()
 
     async def call(self, session_id: str, frame: Any) -> bytes:
         """Execute a frame of requests from inside the cluster, a buffer that is read in place from plasma."""
@@ -292,20 +270,15 @@ class PolicyReplica(ClientApi, SiblingApi):
         """Return the metadata of the least loaded replica on the machine with boot id `caller`, or of this replica."""
         machines = [boot_id()] if caller == SERVERS_MACHINE else [caller, boot_id()]
         places = [ClientLocation(boot_id=machine, must_be_near=True) for machine in machines]
-        metadata, _ = await self._place_at_sibling(*places) or (self.metadata(), None)
+        metadata, _ = await self._rebalancer.place(*places) or (self.metadata(), None)
         return {key: value for key, value in metadata.items() if key != "plasma"}
-
-    async def _place_at_sibling(self, *places: ClientLocation) -> tuple[dict[str, Any], Any] | None:
-        """Return metadata and actor of another replica if it suits the client better, see `Rebalancer.place`."""
-        found: tuple[dict[str, Any], Any] | None = await self._rebalancer.place(*places)
-        return found
 
     # Other replicas: `SiblingApi`.
 
     def _load_of(self, sessions: int) -> ReplicaLoad:
         accepts = self._engine.ready and not (self._engine.draining or replica_is_ending())
         node = ray.get_runtime_context().get_node_id()
-        return ReplicaLoad(self._peers.own_name, sessions, accepts, node, boot_id(), self._engine.version)
+        return ReplicaLoad(self._peers.own_name, sessions, accepts, node, boot_id(), self._engine.models.version)
 
     async def expect_client(self) -> tuple[dict[str, Any], Any]:
         """Return metadata and actor for a client that another replica redirects to this one."""
@@ -405,12 +378,18 @@ def _engine(args: ServerArgs, limits: Limits, migrator: SessionMigrator) -> Engi
         session_limit=args.sessions.limit,
         session_idle_s=args.sessions.idle_s,
         version=version_of(args),
-        check=partial(require_fit, args.dialects),
+        check=args.dialects.require_fit,
         limits=args.limits.call_limits(),
         reply_bytes=limits.reply_bytes,
         in_flight_bytes=limits.in_flight_bytes,
         finder=migrator,
     )
+
+
+def _stream_endpoint(engine: Engine, args: ServerArgs, admit: Admit | NoKey) -> WebSocketServer:
+    slow_s, idle_s, hosts = args.limits.slow_s, args.sessions.idle_s, args.access.hosts
+    host, ports, limits = _plain_host(), args.stream.ports, args.limits.limits()
+    return WebSocketServer(engine, limits, host, ports, admit, slow_s=slow_s, idle_s=idle_s, hosts=hosts)
 
 
 def hide_gpus(given: Sequence[str]) -> None:

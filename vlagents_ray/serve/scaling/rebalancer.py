@@ -116,9 +116,7 @@ class Rebalancer:
 
     def __init__(self, engine: Engine, siblings: Siblings, own_load: Callable[[int], ReplicaLoad]) -> None:
         """Balance the sessions of `engine` and `siblings`; `own_load` returns the load of this replica for a count."""
-        self._engine = engine
-        self._siblings = siblings
-        self._own_load = own_load
+        self._engine, self._siblings, self._own_load = engine, siblings, own_load
         self._expected: deque[float] = deque()  # times at which clients were sent here that have no session yet
         self._opened = 0
         self._others: list[ReplicaLoad] = []

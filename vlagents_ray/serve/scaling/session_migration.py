@@ -32,6 +32,7 @@ from typing import Any, Concatenate, ParamSpec, TypeVar
 from vlagents_ray.errors import VLAgentsError
 from vlagents_ray.protocol.messages import Op, Reply, Request
 from vlagents_ray.serve.engine.engine import Engine
+from vlagents_ray.serve.engine.sender import settle
 from vlagents_ray.serve.requests import PendingRequest
 from vlagents_ray.serve.sessions import Outdated, Version
 
@@ -70,10 +71,8 @@ class HeldSessions:
 
     def __init__(self, engine: Engine, loop: asyncio.AbstractEventLoop, in_thread: InThread, spawn: Spawn) -> None:
         """Move the sessions of an engine; `in_thread` runs a slow call (unpickling) on another thread."""
-        self._engine = engine
-        self._loop = loop
-        self._in_thread = in_thread
-        self._spawn = spawn
+        self._engine, self._loop = engine, loop
+        self._in_thread, self._spawn = in_thread, spawn
         self._claims: OrderedDict[str, asyncio.Task[bool]] = OrderedDict()  # releases that other replicas requested
         self._released: OrderedDict[str, float] = OrderedDict()  # time of release by session, s
         self._leaving: dict[str, asyncio.Future[None]] = {}  # sessions being given away, until another replica has them
@@ -132,7 +131,7 @@ class HeldSessions:
         if self._engine.draining:
             return False
         try:
-            await self._in_thread(self._engine.transfer.adopt, session_id, state)
+            await self._in_thread(self._engine.adopt, session_id, state)
         except Outdated:  # the call is a repetition, or a newer state arrived first
             return True
         except VLAgentsError as error:
@@ -182,11 +181,7 @@ class HeldSessions:
         If the request has not begun after `timeout_s`, it is withdrawn, and has no effect.
         """
         answered: asyncio.Future[Reply] = self._loop.create_future()
-
-        def done(reply: Reply) -> None:
-            self._loop.call_soon_threadsafe(_settle, answered, reply)
-
-        pending = PendingRequest(session_id, Request(op, kwargs=kwargs), done)
+        pending = PendingRequest(session_id, Request(op, kwargs=kwargs), partial(settle, answered))
         self._engine.submit([pending])
         await asyncio.wait([answered], timeout=timeout_s)
         if not answered.done():
@@ -214,11 +209,6 @@ class Peer(ABC):
         self, method: Callable[Concatenate[HeldSessions, P], Awaitable[T]], *args: P.args, **kwargs: P.kwargs
     ) -> T:
         """Call `method`, at the other replica, and return its result."""
-
-
-def _settle(answered: asyncio.Future[Reply], reply: Reply) -> None:
-    if not answered.done():
-        answered.set_result(reply)
 
 
 Peers = Callable[[], Awaitable[Sequence[Peer]]]
@@ -290,7 +280,7 @@ class SessionMigrator:
             self._unannounced[session_id] = step
             if len(self._unannounced) > 1:
                 return
-        self._loop.call_soon_threadsafe(lambda: self._loop.call_later(_GATHER_S, self._announce_all))
+        self._loop.call_soon_threadsafe(lambda: self._spawn(self._announce_all()))
 
     async def hand_over(self) -> int:
         """Give all sessions to other replicas, since this one stops, and close the queue.
@@ -366,16 +356,16 @@ class SessionMigrator:
         state = await self._answer(peer.ask(HeldSessions.copy, session_id), EXPORT_S)
         if state is None:
             return False
-        arriving = await self._in_thread(self._engine.transfer.prepare, session_id, state, _LOAD_S)
+        arriving = await self._in_thread(self._engine.prepare_adoption, session_id, state, _LOAD_S)
         version = state["steps"], state["moves"]
         release = self._spawn(self._answer(peer.ask(HeldSessions.release, session_id, version, uuid.uuid4().hex)))
         while not (await asyncio.wait([release], timeout=_ANSWER_S))[0]:
             if await self._query_peer(peer, []) is None:  # the replica hangs: only the copy waits for it
                 self._finish(session_id)
         if not release.result():
-            self._engine.transfer.discard(arriving)
+            self._engine.models.release(arriving)
             return False
-        self._engine.transfer.enter(arriving)
+        self._engine.enter(arriving)
         logger.info(
             "session %s: fetched from another replica, after %d acts", session_id, state["steps"] - state["first"]
         )
@@ -437,15 +427,13 @@ class SessionMigrator:
             logger.info("another replica does not answer: %r", error)
             return None
 
-    def _announce_all(self) -> None:
+    async def _announce_all(self) -> None:
+        await asyncio.sleep(_GATHER_S)
         with self._lock:
             begun, self._unannounced = self._unannounced, {}
         if not self._closed:
-            self._spawn(self._drop_older_at_peers(begun))
-
-    async def _drop_older_at_peers(self, steps: dict[str, int]) -> None:
-        for peer in await self._peers():
-            self._spawn(self._answer(peer.ask(HeldSessions.drop_older, steps)))
+            for peer in await self._peers():
+                self._spawn(self._answer(peer.ask(HeldSessions.drop_older, begun)))
 
     def _finish(self, session_id: str) -> None:
         with self._lock:

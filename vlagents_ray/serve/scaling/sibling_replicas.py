@@ -39,11 +39,9 @@ class SiblingApi(Protocol):
 
     async def expect_client(self) -> tuple[dict[str, Any], Any]:
         """Expect a client that another replica sends here; return the metadata for the client, and the actor."""
-        ...
 
     async def peer(self, method: str, *args: Any) -> Any:
         """Call the method of that name in `PEER_METHODS`, and return its result."""
-        ...
 
 
 class PeerMethod(NamedTuple):
@@ -80,8 +78,7 @@ class _Sibling(Peer):
     """Another replica: for moving sessions, for pushes of weights (`WeightsReplica`), and for the live page."""
 
     def __init__(self, name: str, actor: Any) -> None:
-        self.name = name
-        self._actor = actor
+        self.name, self._actor = name, actor
 
     async def ask(
         self, method: Callable[Concatenate[HeldSessions, P], Awaitable[T]], *args: P.args, **kwargs: P.kwargs
@@ -90,10 +87,6 @@ class _Sibling(Peer):
             found: T = await self.call(method, *args)
         except VLAgentsError as error:  # the server has another version
             raise PeerUnreachable(str(error)) from error
-        return found
-
-    async def weights(self, method: Callable[..., T], *args: Any) -> T:
-        found: T = await self.call(method, *args)
         return found
 
     async def call(self, method: Callable[..., Any], *args: Any) -> Any:
@@ -109,14 +102,15 @@ class _Sibling(Peer):
         except (ray.exceptions.RayError, TimeoutError, asyncio.TimeoutError) as error:  # or the network is partitioned
             raise PeerUnreachable(str(error) or f"no answer within {limit_s} s") from error
 
+    weights = call
+
 
 class ReplicasInCluster(OtherReplicas):
     """The replicas of applications; each call looks them up again, since they may change."""
 
     def __init__(self, apps: Collection[str], but: str = "") -> None:
         """Call the replicas of `apps`, apart from the replica whose full name is `but`."""
-        self._apps = apps
-        self._but = but
+        self._apps, self._but = apps, but
         self._views: dict[str, SnapshotReader] = {}  # result of the last lookup
         self._found = float("-inf")
 

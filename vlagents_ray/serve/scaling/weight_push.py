@@ -34,14 +34,10 @@ _ATTEMPTS = 3  # attempts to commit at a replica that cannot be reached
 class WeightsReplica(Protocol):
     """A replica's interface for a push."""
 
-    @property
-    def name(self) -> str:
-        """Name of the replica, for messages."""
-        ...
+    name: str  # for messages
 
     async def weights(self, method: Callable[..., T], *args: Any) -> T:
         """Call a method of the replica's `WeightUpdates`; also raise `PeerEnded` and `PeerUnreachable`."""
-        ...
 
 
 class ThisReplica(WeightsReplica):
@@ -49,12 +45,7 @@ class ThisReplica(WeightsReplica):
 
     def __init__(self, name: str, updates: WeightUpdates) -> None:
         """Set the updates of this replica's engine."""
-        self._name = name
-        self._updates = updates
-
-    @property
-    def name(self) -> str:
-        return self._name
+        self.name, self._updates = name, updates
 
     async def weights(self, method: Callable[..., T], *args: Any) -> T:
         """Call the method on another thread, since it may be slow."""
@@ -67,8 +58,7 @@ class WeightPusher:
 
     def __init__(self, own: WeightsReplica, others: Callable[[], Awaitable[Sequence[WeightsReplica]]]) -> None:
         """Push to the `own` replica and to the `others`, which are looked up for each push."""
-        self._own = own
-        self._others = others
+        self._own, self._others = own, others
         self._pushing = asyncio.Lock()
         self._known: set[str] = set()  # names of replicas that have answered
 
