@@ -10,8 +10,8 @@ import numpy as np
 from eval_fakes import LINE, OTHER_LINE
 
 from vlagents_ray.evaluate import EvalConfig, Results
+from vlagents_ray.evaluate.artifacts.recorder import VideoRecorder, save_videos
 from vlagents_ray.evaluate.artifacts.storage import versions
-from vlagents_ray.evaluate.artifacts.video import VideoRecorder, save_videos
 from vlagents_ray.evaluate.episode.failures import Failure
 from vlagents_ray.evaluate.episode.records import EnvInfo, EpisodeResult, WorkerInfo
 from vlagents_ray.evaluate.plan.cases import EvalCase

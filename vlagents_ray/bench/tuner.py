@@ -19,7 +19,7 @@ from vlagents_ray.bench.line_process import LineProcess, ProcessFailed, our_envi
 from vlagents_ray.bench.tuning_choice import MeasuredPoint, TuningGoal, Variant, sessions
 from vlagents_ray.bench.tuning_process import FRAMES, ProcessSettings, save_observations
 from vlagents_ray.errors import ConfigError, VLAgentsError
-from vlagents_ray.evaluate.artifacts.trajectory import Trajectory, videos_of
+from vlagents_ray.evaluate.artifacts.recorder import Trajectory, videos_of
 from vlagents_ray.interface import Obs
 from vlagents_ray.policies.compilation import Quantization
 from vlagents_ray.registry import require

@@ -17,9 +17,15 @@ from in_process_evaluation import play
 
 from vlagents_ray.errors import ConfigError, EnvFailed
 from vlagents_ray.evaluate import ClockConfig, EvalConfig, PolicyConfig, SuiteConfig, WorkerConfig
-from vlagents_ray.evaluate.artifacts.recorder import Recording
-from vlagents_ray.evaluate.artifacts.trajectory import NO_VERSION, Trajectory, TrajectoryRecorder, videos_of
-from vlagents_ray.evaluate.artifacts.video import VideoRecorder, save_videos
+from vlagents_ray.evaluate.artifacts.recorder import (
+    NO_VERSION,
+    Recording,
+    Trajectory,
+    TrajectoryRecorder,
+    VideoRecorder,
+    save_videos,
+    videos_of,
+)
 from vlagents_ray.evaluate.episode.records import EpisodeResult
 from vlagents_ray.evaluate.episode.second_pass import PlayedEpisode
 from vlagents_ray.evaluate.plan.cases import EvalCase

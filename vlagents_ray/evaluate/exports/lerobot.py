@@ -21,9 +21,8 @@ from vlagents_ray.dataset_contract import (
     rotation_vector_in,
 )
 from vlagents_ray.errors import ConfigError
+from vlagents_ray.evaluate.artifacts.recorder import DEFAULT_FPS, Trajectory, videos_of
 from vlagents_ray.evaluate.artifacts.storage import link_or_copy, require_there, whole_folder
-from vlagents_ray.evaluate.artifacts.trajectory import Trajectory, videos_of
-from vlagents_ray.evaluate.artifacts.video import DEFAULT_FPS
 from vlagents_ray.evaluate.results.reader import CellResults, Episode, Results
 from vlagents_ray.naming import did_you_mean, distinct
 from vlagents_ray.registry import require
