@@ -14,10 +14,9 @@ import numpy as np
 
 from vlagents_ray.chunking.player import ChunkPlayer, PlayerSettings
 from vlagents_ray.errors import CheckpointFailed, EnvFailed, InvalidAction, PolicyFailed, PolicyUnavailable
-from vlagents_ray.evaluate.episode.episode import transport_of
+from vlagents_ray.evaluate.episode.episode import EpisodeStats, transport_of
 from vlagents_ray.evaluate.episode.failures import env_side, policy_side
 from vlagents_ray.evaluate.episode.records import EpisodeResult
-from vlagents_ray.evaluate.episode.stats import EpisodeStats
 from vlagents_ray.evaluate.plan.cases import EvalCase
 from vlagents_ray.evaluate.plan.config import RobotConfig, canonical
 from vlagents_ray.evaluate.plan.jobs import EpisodeKey, Job
