@@ -27,9 +27,8 @@ from vlagents_ray.evaluate.results.store import Store
 from vlagents_ray.evaluate.results.summary import Summary, summarize, write_summary
 from vlagents_ray.evaluate.trackers import TrackerFeed
 from vlagents_ray.evaluate.workers.cluster import ray_cluster, unused_gpus
-from vlagents_ray.evaluate.workers.pool import WorkerPool
+from vlagents_ray.evaluate.workers.pool import FailedAttempts, InProcessWorkers, WorkerPool, Workers, dispatch
 from vlagents_ray.evaluate.workers.rollout import AgentFactory, Report, agents, factory_program
-from vlagents_ray.evaluate.workers.worker import FailedAttempts, InProcessWorkers, Workers, dispatch
 from vlagents_ray.interface import Agent
 from vlagents_ray.ray_tools.signals import stop_signals
 

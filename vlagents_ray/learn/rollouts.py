@@ -20,9 +20,8 @@ from vlagents_ray.evaluate.plan.cases import cells, require_envs
 from vlagents_ray.evaluate.plan.config import EvalConfig
 from vlagents_ray.evaluate.plan.jobs import EpisodeKey, Job, JobQueue
 from vlagents_ray.evaluate.workers.cluster import ray_cluster
-from vlagents_ray.evaluate.workers.pool import WorkerPool
+from vlagents_ray.evaluate.workers.pool import FailedAttempts, WorkerPool, dispatch
 from vlagents_ray.evaluate.workers.rollout import Report, agents
-from vlagents_ray.evaluate.workers.worker import FailedAttempts, dispatch
 from vlagents_ray.interface import Agent
 from vlagents_ray.learn.columns import EXTRA
 from vlagents_ray.learn.transitions import WANTED, TransitionRecorder
