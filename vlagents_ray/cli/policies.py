@@ -13,9 +13,12 @@ from typing import TYPE_CHECKING, Any
 from vlagents_ray.cli.listing import require_packages
 from vlagents_ray.cli.options import YAML_SUFFIXES
 from vlagents_ray.cli.ray_session import quiet_ray
+from vlagents_ray.client.agent import RemoteAgent
 from vlagents_ray.contract import require_match
 from vlagents_ray.envs.base import known_contract
 from vlagents_ray.errors import ConfigError, ContractMismatch
+from vlagents_ray.evaluate import EvalConfig, PolicyConfig, check, most_cpus, most_gpus
+from vlagents_ray.evaluate.plan.cases import cells
 from vlagents_ray.ray_tools.private import gpus_here
 from vlagents_ray.ray_tools.session import joined
 from vlagents_ray.serve.launch.deployment_file import (
@@ -31,8 +34,6 @@ from vlagents_ray.serve.models.checkpoints import STEP, resolved
 if TYPE_CHECKING:
     from ray.serve.schema import ServeDeploySchema
 
-    from vlagents_ray.evaluate import EvalConfig, PolicyConfig
-
 _STARTING_S = 30.0  # time limit for a server at a URL
 
 
@@ -43,8 +44,6 @@ def served(config: EvalConfig, address: str | None = None, *, replica_per_gpu: b
     Yields:
         The evaluation with the URLs of all its policies.
     """
-    from vlagents_ray.evaluate import check, most_cpus, most_gpus
-
     with contextlib.ExitStack() as stack:
         stack.enter_context(quiet_ray(None))
         if address is not None:
@@ -69,8 +68,6 @@ def served(config: EvalConfig, address: str | None = None, *, replica_per_gpu: b
 
 def _require_gpus(config: EvalConfig) -> None:
     """Raise `ConfigError` if workers need more GPUs than this machine has: Ray would never start them here."""
-    from vlagents_ray.evaluate.plan.cases import cells
-
     wanted = max(cell.worker.gpus for cell in cells(config))
     if wanted and wanted > (here := gpus_here()):
         raise ConfigError(
@@ -81,8 +78,6 @@ def _require_gpus(config: EvalConfig) -> None:
 
 def _require_match(config: EvalConfig, parts: Mapping[str, ServeDeploySchema]) -> None:
     """Raise `ContractMismatch` if a policy to be served does not fit an env, as far as both state their contracts."""
-    from vlagents_ray.evaluate.plan.cases import cells
-
     policy_contract = cache(lambda application: stated_contract(parts[application]))
     for cell in cells(config):
         application = str(cell.policy.url).removeprefix("serve://")
@@ -140,7 +135,5 @@ def _found(policy: PolicyConfig, url: str) -> dict[str, Any]:
 
 def _metadata(url: str) -> dict[str, Any]:
     """Request the metadata of a server, which may be starting."""
-    from vlagents_ray import RemoteAgent
-
     with RemoteAgent(url, connect_timeout_s=_STARTING_S) as agent:
         return agent.metadata

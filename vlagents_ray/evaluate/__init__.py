@@ -28,14 +28,12 @@ from vlagents_ray.evaluate.results.stopping import confidence_sequence
 from vlagents_ray.evaluate.results.summary import Group, Summary
 
 if TYPE_CHECKING:
-    from vlagents_ray.evaluate.report.progress import Progress, progress_for
-    from vlagents_ray.evaluate.report.terminal import print_summary, results_table
+    from vlagents_ray.evaluate.report.terminal import Progress, print_summary, progress_for, results_table
     from vlagents_ray.evaluate.run import EvaluationInterrupted, OutOfTime, check, evaluate
     from vlagents_ray.evaluate.workers.cluster import most_cpus, most_gpus
 
 _LATE = {
-    "report.progress": ("Progress", "progress_for"),
-    "report.terminal": ("print_summary", "results_table"),
+    "report.terminal": ("Progress", "print_summary", "progress_for", "results_table"),
     "run": ("EvaluationInterrupted", "OutOfTime", "check", "evaluate"),
     "workers.cluster": ("most_cpus", "most_gpus"),
 }  # module: its names

@@ -20,7 +20,7 @@ from vlagents_ray.evaluate.plan.config import EvalConfig
 from vlagents_ray.evaluate.plan.jobs import EpisodeKey, Job, JobQueue, plan
 from vlagents_ray.evaluate.report.page import FILE as REPORT
 from vlagents_ray.evaluate.report.page import write_report
-from vlagents_ray.evaluate.report.progress import Progress
+from vlagents_ray.evaluate.report.terminal import Progress
 from vlagents_ray.evaluate.results.reader import Results, rate_of
 from vlagents_ray.evaluate.results.stopping import Stopping
 from vlagents_ray.evaluate.results.store import Store

@@ -13,7 +13,7 @@ from vlagents_ray.contract import Contract
 from vlagents_ray.errors import ConfigError, WeightsLost
 from vlagents_ray.evaluate.plan.cases import require_envs
 from vlagents_ray.evaluate.plan.config import EvalConfig, PushedWeights
-from vlagents_ray.evaluate.report.progress import Progress
+from vlagents_ray.evaluate.report.terminal import Progress
 from vlagents_ray.evaluate.results.database import FILE
 from vlagents_ray.evaluate.results.summary import Summary
 from vlagents_ray.evaluate.run import evaluate

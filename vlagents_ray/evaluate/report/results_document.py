@@ -13,7 +13,7 @@ from vlagents_ray.evaluate.episode.failures import Failure
 from vlagents_ray.evaluate.episode.records import EpisodeResult
 from vlagents_ray.evaluate.plan.cases import EvalCase
 from vlagents_ray.evaluate.plan.jobs import Job
-from vlagents_ray.evaluate.report.progress import Progress, seconds_left
+from vlagents_ray.evaluate.report.terminal import Progress, seconds_left
 from vlagents_ray.evaluate.results.database import FILE, RUNNING
 from vlagents_ray.evaluate.results.reader import CellResults, Episode, Results, rate_of
 from vlagents_ray.evaluate.results.statistics import Rate
