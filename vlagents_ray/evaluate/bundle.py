@@ -20,8 +20,9 @@ import zipfile
 import zlib
 from collections.abc import Iterator, Mapping
 from contextlib import closing, contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from glob import escape
+from itertools import islice, zip_longest
 from pathlib import Path
 from typing import IO, Any, Literal
 
@@ -43,7 +44,7 @@ from vlagents_ray.evaluate.artifacts.storage import (
     whole,
 )
 from vlagents_ray.evaluate.episode.episode import options_of_reset
-from vlagents_ray.evaluate.episode.failures import env_side
+from vlagents_ray.evaluate.episode.failures import EnvStep, env_side
 from vlagents_ray.evaluate.episode.second_pass import play_actions
 from vlagents_ray.evaluate.plan.config import canonical, fingerprint
 from vlagents_ray.evaluate.report.page import FILE as REPORT
@@ -441,10 +442,14 @@ def _contradictions(episode: Episode, trajectory: Trajectory) -> Iterator[str]:
     total = float(sum(trajectory.rewards.tolist()))
     if not math.isclose(total, result.episode_return, rel_tol=_TOLERANCE, abs_tol=1e-12):
         yield "the recorded rewards have another sum"
-    success = trajectory.success.astype(bool).tolist()
-    first = next((number for number, solved in enumerate(success, 1) if solved), None)
-    if (first, bool(success and success[-1])) != (result.first_success, result.success_at_end):
+    if _outcome(trajectory.success.astype(bool).tolist())[1:] != (result.success_at_end, result.first_success):
         yield "the recorded success is not that of the table"
+
+
+def _outcome(success: list[bool]) -> tuple[bool, bool, int | None]:
+    """Return success once, success at the end, and the number of steps after which it was first solved."""
+    first = next((number for number, solved in enumerate(success, 1) if solved), None)
+    return first is not None, bool(success and success[-1]), first
 
 
 def _finding(subject: str, odd: list[str], fine: str) -> Finding:
@@ -476,20 +481,41 @@ _CODE = re.compile("trust.*|module|source_dir")  # options that choose code, alt
 _WORD = re.compile(r"\w[\w.+-]{0,63}")  # a value that is text, and no path, URL or "module:Class"
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(slots=True)
 class Replayed:
-    """The outcome of the recorded actions."""
+    """The recorded actions in an environment here, compared with the recording step by step."""
 
-    steps: int
-    outcome: tuple[bool, bool, int | None]  # success once, success at the end, steps after which it was first solved
-    differs_from: int | None  # first step with another state, reward or success; 0 is the reset
-    largest: float  # difference of a number of the state or of a reward
-    described: Mapping[str, Any]  # by the environment here
+    recorded: Trajectory
+    success: list[bool] = field(default_factory=list)  # after each step
+    differs_from: int | None = None  # first step with another state, reward or success; 0 is the reset
+    largest: float = 0.0  # difference of a number of the state or of a reward
+    described: Mapping[str, Any] = field(default_factory=dict)  # by the environment here
 
-    @property
-    def same(self) -> bool:
-        """Whether every number is the same to the bit."""
-        return self.differs_from is None
+    def add(self, number: int, obs: Obs, step: EnvStep | None) -> None:
+        """Compare an observation, and the other outputs of its step, of which the reset has none."""
+        now = {part: np.asarray(values, np.float32) for part, values in obs.state.items()}
+        if now.keys() != self.recorded.state.keys() or (obs.gripper is None) != (self.recorded.gripper is None):
+            self._differ(number, float("inf"))
+        else:
+            for part, values in now.items():
+                self._compare(number, self.recorded.state[part][number], values)
+            if self.recorded.gripper is not None:
+                self._compare(number, self.recorded.gripper[number], np.asarray(obs.gripper, np.float32))
+        if step is not None:
+            self.success.append(step.success)
+            self._compare(number, self.recorded.rewards[number - 1], np.float64(step.reward))
+            if bool(self.recorded.success[number - 1]) != step.success:
+                self._differ(number, 0.0)
+
+    def _compare(self, number: int, before: Any, now: Any) -> None:
+        if before.shape != now.shape:
+            self._differ(number, float("inf"))
+        elif before.tobytes() != now.tobytes():
+            self._differ(number, float(np.max(np.abs(np.asarray(before, np.float64) - np.asarray(now, np.float64)))))
+
+    def _differ(self, number: int, by: float) -> None:
+        self.differs_from = number if self.differs_from is None else self.differs_from
+        self.largest = max(self.largest, by)
 
 
 def require_harmless(cell: CellResults) -> None:
@@ -523,59 +549,15 @@ def replay_actions(cell: CellResults, episode: Episode, trajectory: Trajectory) 
     try:
         with env_side("reset"):
             begin = options_of_reset(env, key.episode, cell.settings.get("reset_options"))
-        compared = _Comparison(trajectory)
-        played = play_actions(env, key.seed, begin, trajectory.actions, images=False)
-        for number, (obs, step) in enumerate(played):
-            compared.add(number, obs)
-            if step is not None:
-                compared.add_outcome(number, step.reward, step.success)
+        played = Replayed(trajectory)
+        for number, (obs, step) in enumerate(play_actions(env, key.seed, begin, trajectory.actions, images=False)):
+            played.add(number, obs, step)
         with env_side("describe"):
-            return compared.result(env.describe())
+            played.described = env.describe()
+        return played
     finally:
         with env_side("close"):
             env.close()
-
-
-class _Comparison:
-    """Compares an environment with a recording, step by step."""
-
-    def __init__(self, recorded: Trajectory) -> None:
-        self._recorded = recorded
-        self._from: int | None = None
-        self._largest = 0.0
-        self._success: list[bool] = []
-
-    def add(self, number: int, obs: Obs) -> None:
-        now = {part: np.asarray(values, np.float32) for part, values in obs.state.items()}
-        if now.keys() != self._recorded.state.keys() or (obs.gripper is None) != (self._recorded.gripper is None):
-            self._differ(number, float("inf"))
-            return
-        pairs = [(self._recorded.state[part][number], values) for part, values in now.items()]
-        if self._recorded.gripper is not None:
-            pairs.append((self._recorded.gripper[number], np.asarray(obs.gripper, np.float32)))
-        for before, values in pairs:
-            self._compare(number, np.asarray(before), np.asarray(values))
-
-    def add_outcome(self, number: int, reward: float, success: bool) -> None:
-        self._success.append(success)
-        self._compare(number, self._recorded.rewards[number - 1], np.float64(reward))
-        if bool(self._recorded.success[number - 1]) != success:
-            self._differ(number, 0.0)
-
-    def result(self, described: Mapping[str, Any]) -> Replayed:
-        first = next((number for number, success in enumerate(self._success, 1) if success), None)
-        outcome = (first is not None, bool(self._success and self._success[-1]), first)
-        return Replayed(len(self._success), outcome, self._from, self._largest, described)
-
-    def _compare(self, number: int, before: Any, now: Any) -> None:
-        if before.shape != now.shape:
-            self._differ(number, float("inf"))
-        elif before.tobytes() != now.tobytes():
-            self._differ(number, float(np.max(np.abs(np.asarray(before, np.float64) - np.asarray(now, np.float64)))))
-
-    def _differ(self, number: int, by: float) -> None:
-        self._from = number if self._from is None else self._from
-        self._largest = max(self._largest, by)
 
 
 def _is_plain(value: object) -> bool:
@@ -600,20 +582,10 @@ def _check_replays(results: Results, most: int, *, trust: bool) -> Iterator[Find
 
 def _chosen(results: Results, most: int) -> list[tuple[CellResults, Episode, Trajectory]]:
     """Return the first episode with a recording of each cell in turns, then the second of each, and so on."""
-    left = [
-        (cell, iter([one for one in cell.episodes if one.result.status == "done" and one.trajectory is not None]))
-        for cell in results.cells
-    ]
-    found: list[tuple[CellResults, Episode, Trajectory]] = []
-    while left and len(found) < most:
-        for pair in list(left):
-            cell, episodes = pair
-            one = next(episodes, None)
-            if one is None:
-                left.remove(pair)
-            elif len(found) < most and (trajectory := _recorded(results, one)) is not None:
-                found.append((cell, one, trajectory))
-    return found
+    by_cell = [[(cell, one) for one in cell.episodes if one.result.status == "done"] for cell in results.cells]
+    turns = (pair for turn in zip_longest(*by_cell) for pair in turn if pair is not None)
+    found = ((*pair, trajectory) for pair in turns if (trajectory := _recorded(results, pair[1])) is not None)
+    return list(islice(found, most))
 
 
 def _replay(cell: CellResults, episode: Episode, trajectory: Trajectory, *, trust: bool) -> Finding:
@@ -626,26 +598,21 @@ def _replay(cell: CellResults, episode: Episode, trajectory: Trajectory, *, trus
         played = replay_actions(cell, episode, trajectory)
     except VLAgentsError as error:
         return Finding(subject, "not checked", str(error))
-    result = episode.result
-    if played.outcome != (result.success_once, result.success_at_end, result.first_success):
-        now, then = ("solved" if solved else "not solved" for solved in (played.outcome[0], result.success_once))
-        return Finding(subject, "differs", f"{now} here, {then} there; {_from(played)}")
-    detail = f"{played.steps} actions, every state, reward and success to the bit"
-    if not played.same:
-        detail = f"the same outcome, other numbers; {_from(played)}"
-    if odd := _described(cell.described, played.described):
-        detail += f"; the environment says of itself here: {odd}"
-    return Finding(subject, "equal" if played.same else "other here", detail)
-
-
-def _from(played: Replayed) -> str:
-    return f"the numbers differ from step {played.differs_from} of {played.steps} on, by at most {played.largest:.3g}"
-
-
-def _described(there: Mapping[str, Any], here: Mapping[str, Any]) -> str:
+    result, outcome, steps = episode.result, _outcome(played.success), len(played.success)
+    differs = f"the numbers differ from step {played.differs_from} of {steps} on, by at most {played.largest:.3g}"
+    if outcome != (result.success_once, result.success_at_end, result.first_success):
+        now, then = ("solved" if solved else "not solved" for solved in (outcome[0], result.success_once))
+        return Finding(subject, "differs", f"{now} here, {then} there; {differs}")
+    same = played.differs_from is None
+    detail = f"{steps} actions, every state, reward and success to the bit"
+    if not same:
+        detail = f"the same outcome, other numbers; {differs}"
+    there, here = cell.described, played.described
     odd = [
         f"{name} {str(here.get(name))[:_LENGTH]}, there {str(there.get(name))[:_LENGTH]}"
         for name in sorted(there.keys() | here.keys())
         if there.get(name) != here.get(name)
     ]
-    return "; ".join(odd)
+    if odd:
+        detail += f"; the environment says of itself here: {'; '.join(odd)}"
+    return Finding(subject, "equal" if same else "other here", detail)
