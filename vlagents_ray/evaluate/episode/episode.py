@@ -36,6 +36,10 @@ from vlagents_ray.interface import POLICY, Act, Agent, Obs
 from vlagents_ray.validation import check_action
 
 _LITTLE_ENDIAN = np.dtype("<f4")
+_KEPT = (  # what `EpisodeStats` counts as a result has it
+    "key", "steps", "episode_return", "reset_ms", "policy_seconds", "ticks_waited", "ticks_held", "checkpoint",
+    "weights", "revision", "policy_version", "policy_fingerprint", "first_policy_version",
+)  # fmt: skip
 
 
 @dataclass(slots=True)
@@ -111,36 +115,25 @@ class EpisodeStats:
 
     def result(self, transport: str, failed: PolicyFailed | None = None) -> EpisodeResult:
         """Return the result of the finished episode; `failed` is the policy error that ended it, if any."""
+        kept = {name: getattr(self, name) for name in _KEPT}
         return EpisodeResult(
-            key=self.key,
+            **kept,
             status="done" if failed is None else "policy_error",
             success_once=self.first_success is not None and failed is None,
             success_at_end=self.success and failed is None,
             first_success=self.first_success if failed is None else None,
-            steps=self.steps,
-            episode_return=self.episode_return,
             ending=self.ending if failed is None else "error",
             instruction="; ".join([*self.earlier, self.instruction]),
             error=None if failed is None else f"{failed.code}: {failed}",
             seconds=perf_counter() - self.started,
-            reset_ms=self.reset_ms,
             env_step_ms=_quantile(self.step_ms, 0.5),
             env_seconds=((self.reset_ms or 0.0) + sum(self.step_ms)) / 1e3,
             acts=len(self.act_ms),
             policy_ms=_quantile(self.act_ms, 0.5),
             policy_p95_ms=_quantile(self.act_ms, 0.95),
-            policy_seconds=self.policy_seconds,
             latency_ms=_quantile(self.latency_ms, 0.5),
-            ticks_waited=self.ticks_waited,
-            ticks_held=self.ticks_held,
             timing_ms={stage: float(np.median(spent)) for stage, spent in sorted(self.timing_ms.items())},
             transport=transport,
-            checkpoint=self.checkpoint,
-            weights=self.weights,
-            revision=self.revision,
-            policy_version=self.policy_version,
-            policy_fingerprint=self.policy_fingerprint,
-            first_policy_version=self.first_policy_version,
             actions_sha256=self.actions.hexdigest(),
         )
 
@@ -290,8 +283,8 @@ class _Episode:
         self._executor, self._done = self.new_executor(), False
 
     def request(self) -> Obs:
-        continuation, info = self._executor.request_info(), self.observer.request_info
-        return _for_policy(self.obs, {**info, **continuation} if info else continuation)
+        info = {**self.observer.request_info, **self._executor.request_info()}
+        return replace(self.obs, info={**self.obs.info, **info}) if info else self.obs
 
     def answered(self, answer: Act | Exception, contract: Contract, seconds: float) -> None:
         """Plan the next ticks from the policy's answer, which took `seconds`."""
@@ -343,7 +336,7 @@ def _instructed(env: BatchEnv, playing: Sequence[_Episode]) -> list[_Episode]:
 def _reset_policy(agent: Agent, episodes: Sequence[_Episode], contract: Contract, options: Mapping[str, Any]) -> None:
     """Reset the session of each episode with its observation, in one message to a server."""
     keys, sessions = [one.stats.key for one in episodes], [one.session for one in episodes]
-    first, texts = [_for_policy(one.obs, {}) for one in episodes], [one.stats.instruction for one in episodes]
+    first, texts = [one.obs for one in episodes], [one.stats.instruction for one in episodes]
     seeds = [key.seed if key.policy_seed is None else key.policy_seed for key in keys]
     given = {**options, "env": keys[0].env}
     if hasattr(agent, "metadata"):  # a server also compares the contract, and answers 409
@@ -416,7 +409,3 @@ def options_of_reset(env: Environment, episode: int, options: Mapping[str, Any] 
     """Return the options for the environment's reset: the user's `options` override the benchmark's."""
     begin = {} if env.init_states is None else {"init_state": episode % env.init_states}
     return begin | dict(options or {}) or None
-
-
-def _for_policy(obs: Obs, info: Mapping[str, Any]) -> Obs:
-    return replace(obs, info={**obs.info, **info}) if info else obs

@@ -71,15 +71,6 @@ class Report:
     worker: WorkerInfo | None = None  # if `env` or `policy` is new
 
 
-@dataclass(slots=True)
-class _Setup:
-    """The findings of a worker before an episode, whatever its outcome."""
-
-    env: EnvInfo | None = None
-    policy: dict[str, Any] | None = None
-    worker: WorkerInfo | None = None
-
-
 @dataclass(frozen=True, slots=True)
 class Heartbeat:
     """A worker's current phase, and how long it has lasted."""
@@ -128,9 +119,9 @@ class Rollout:
     def run(self, jobs: tuple[Job, ...]) -> list[Report]:
         """Play the episodes of one cell, in parallel if there are several; return a report for each."""
         self._thread = threading.get_ident()
-        setup = _Setup()
+        found: dict[str, Any] = {}  # fields of the first report, whatever the outcome
         try:
-            reports = self._played(jobs, setup)
+            reports = self._played(jobs, found)
         except VLAgentsError as error:
             reports = [Report(failure=explain(error))] * len(jobs)
         finally:
@@ -140,30 +131,31 @@ class Rollout:
             self._drop_agent()
         elif any(report.result is not None for report in reports):
             self._broken_agents = 0
-        return [replace(reports[0], env=setup.env, policy=setup.policy, worker=setup.worker), *reports[1:]]
+        return [replace(reports[0], **found), *reports[1:]]
 
     def close(self) -> None:
         self._drop_agent()
         self._drop_env()
 
-    def _played(self, jobs: tuple[Job, ...], setup: _Setup) -> list[Report]:
+    def _played(self, jobs: tuple[Job, ...], found: dict[str, Any]) -> list[Report]:
         cell = jobs[0].cell
         if self._agent is None or self._policy != cell.policy.name:
             self._agent = self._connect(cell.policy)
-            setup.policy = self._described or _metadata(self._agent)
+            found["policy"] = self._described or _metadata(self._agent)
         if self._env is None or self._place != cell.place:
             self._env = self._make_env(cell)
             # The driver may have another numpy, which cannot read this one's pickles.
-            setup.env = EnvInfo(
+            found["env"] = EnvInfo(
                 plain_values(self._env.describe()),
                 self._env.contract.to_json(),
                 code_of(env_class(cell.env).__module__),
+                env_program(cell, loaded_code),
+                socket.gethostname(),
             )
-            setup.env = replace(setup.env, program=env_program(cell, loaded_code), host=socket.gethostname())
         agent, env = self._agent, self._env
-        if setup.env is not None or setup.policy is not None:
+        if found:
             require_match(agent.contract, env.contract)
-            setup.worker = _worker_info(cell.policy.name, agent, env)
+            found["worker"] = _worker_info(cell.policy.name, agent, env)
         with contextlib.ExitStack() as stack:
             recordings = [stack.enter_context(self._recorders(self._config, env.contract.control_hz)) for _ in jobs]
             outcomes = self._play(agent, env, jobs, recordings)
@@ -246,12 +238,10 @@ class Rollout:
         try:
             with env_side(f"{cell.env!r}: make"):
                 options, number = cell.suite.env_options, cell.suite.num_envs
-                alone = number == 1  # even if the suite has a simulator for many
-                env = (
-                    SequentialBatch([make_env(cell.env, **options)])
-                    if alone
-                    else make_batch(cell.env, number, **options)
-                )
+                if number == 1:  # even if the suite has a simulator for many
+                    env: BatchEnv = SequentialBatch([make_env(cell.env, **options)])
+                else:
+                    env = make_batch(cell.env, number, **options)
         except EnvFailed as error:
             reason = env_class(cell.env).missing()
             if reason is None:
@@ -301,9 +291,8 @@ def agents(config: EvalConfig, own: Callable[[], Agent] | None, rank: RankName =
 
 
 def _remote_agent(config: EvalConfig, rank: RankName, policy: PolicyConfig) -> RemoteAgent:
-    assert policy.url is not None  # noqa: S101 - `agents` has checked it
     return RemoteAgent(
-        policy.url,
+        str(policy.url),  # `agents` has checked that there is one
         transport=policy.transport,
         timeout_s=config.policy_timeout_s,
         connect_timeout_s=config.connect_timeout_s,
