@@ -7,7 +7,6 @@ import logging
 import sqlite3
 import threading
 import time
-from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from contextlib import closing
 from dataclasses import dataclass
@@ -43,30 +42,14 @@ class About:
     diffs: Sequence[Path]  # of the working trees from their commits
 
 
-class TrackerRun(ABC):
-    """One run in one tracker. Its methods may raise anything; the caller handles it."""
+class WandbRun:
+    """A run whose curves are drawn against `training_step`; values without a step are in its summary.
 
-    @abstractmethod
+    The methods of a run, in any tracker, may raise anything; the caller handles it.
+    """
+
     def __init__(self, about: About) -> None:
         """Begin the run, or resume it."""
-
-    @abstractmethod
-    def log(self, metrics: Mapping[str, float], step: int | None) -> None:
-        """Log values at a training step; without a step they are the only values of the run."""
-
-    @abstractmethod
-    def videos(self, label: str, paths: Sequence[Path], step: int | None) -> None:
-        """Upload videos of episodes of the suite and env `label`, the prefix of its values' names."""
-
-    @abstractmethod
-    def finish(self) -> None:
-        """Send the buffered values, and end the run."""
-
-
-class WandbRun(TrackerRun):
-    """A run whose curves are drawn against `training_step`; values without a step are in its summary."""
-
-    def __init__(self, about: About) -> None:
         self._wandb: Any = require("wandb")
         self._id = about.id
         # Code is in the config and in an artifact, as wandb would only read the driver's folder.
@@ -81,16 +64,19 @@ class WandbRun(TrackerRun):
             self._artifact("code", "code", about.diffs)
 
     def log(self, metrics: Mapping[str, float], step: int | None) -> None:
+        """Log values at a training step; without a step they are the only values of the run."""
         if step is None:
             self._run.summary.update(dict(metrics))
         else:
             self._run.log({STEP: step, **metrics})
 
     def videos(self, label: str, paths: Sequence[Path], step: int | None) -> None:
+        """Upload videos of episodes of the suite and env `label`, the prefix of its values' names."""
         at = "" if step is None else f"-{step}"
         self._artifact(f"videos-{plain(label.replace('/', '_'))}{at}", "videos", paths)
 
     def finish(self) -> None:
+        """Send the buffered values, and end the run."""
         self._run.finish()
 
     def _artifact(self, name: str, kind: str, paths: Sequence[Path]) -> None:
@@ -118,7 +104,7 @@ class TrackioRun(WandbRun):
         self._run.log(shown, step=step or 0)
 
 
-class TensorboardRun(TrackerRun):
+class TensorboardRun:
     """Scalars and texts. TensorBoard plays no MP4, so that the paths of videos are logged."""
 
     def __init__(self, about: About) -> None:
@@ -154,6 +140,7 @@ class TensorboardRun(TrackerRun):
         self._writer.flush()
 
 
+TrackerRun = WandbRun | TensorboardRun
 _RUNS: dict[str, type[TrackerRun]] = {"wandb": WandbRun, "trackio": TrackioRun, "tensorboard": TensorboardRun}
 
 
