@@ -30,7 +30,7 @@ from vlagents_ray.evaluate.report.page import write_report
 from vlagents_ray.evaluate.results.changes import Change, changed, listed, policy_changes, program_changes
 from vlagents_ray.evaluate.results.database import FILE, SCHEMA, VERSION, insert
 from vlagents_ray.evaluate.results.reader import CellResults, Results, Run, Worker, episode_of, reading, table
-from vlagents_ray.evaluate.results.summary import Summary, checkpoint_of, summarize, weights_of, write_summary
+from vlagents_ray.evaluate.results.summary import Summary, stated, summarize, write_summary
 
 _SHOWN = 10  # conflicts in a message
 Row = dict[str, Any]
@@ -297,8 +297,8 @@ def _of_other_weights(folders: Sequence[Results]) -> set[str]:
     first: dict[tuple[str, str | None], str] = {}  # by policy id and checkpoint
     found = set()
     for cell in (cell for each in folders for cell in each.cells):
-        weights = weights_of(cell)
-        if weights is not None and first.setdefault((cell.contender, checkpoint_of(cell)), weights) != weights:
+        weights, checkpoint = stated(cell, "weights"), stated(cell, "checkpoint")
+        if weights is not None and first.setdefault((cell.contender, checkpoint), weights) != weights:
             found.add(cell.policy)
     return found
 

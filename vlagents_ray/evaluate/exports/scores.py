@@ -20,7 +20,7 @@ from vlagents_ray.errors import ConfigError
 from vlagents_ray.evaluate.artifacts.storage import whole_folder
 from vlagents_ray.evaluate.results.reader import CellResults, Results, have_common_rate, rate_of
 from vlagents_ray.evaluate.results.statistics import Rate
-from vlagents_ray.evaluate.results.summary import checkpoint_of, pushed_of, weights_of
+from vlagents_ray.evaluate.results.summary import pushed_of, stated
 from vlagents_ray.naming import distinct, plain
 
 Metric = Literal["success_once", "success_at_end"]
@@ -72,8 +72,8 @@ class Score:
         protocols = [_protocol(cell) for cell in self.cells]
         named = _distinct(one.get("name") for one in protocols)
         protocol = ", ".join(named) or ("the environment's" if any(protocols) else "none stated")
-        weights = _distinct(of(cell) for of in (weights_of, pushed_of) for cell in self.cells)
-        weights = weights or _distinct(checkpoint_of(cell) for cell in self.cells) or ["no digest reported"]
+        weights = _distinct(stated(cell, "weights") for cell in self.cells) + _distinct(map(pushed_of, self.cells))
+        weights = weights or _distinct(stated(cell, "checkpoint") for cell in self.cells) or ["no digest reported"]
         errors = sum(one.status == "policy_error" for one in counted)
         return (
             f"success rate in %, {_WHEN[self.metric]}; {rate.successes} of {rate.episodes} episodes, {kind} {low} to "

@@ -12,7 +12,7 @@ import yaml
 from vlagents_ray.evaluate.plan.config import EvalConfig
 from vlagents_ray.evaluate.results.changes import Change
 from vlagents_ray.evaluate.results.reader import CellResults, Results, Run
-from vlagents_ray.evaluate.results.summary import checkpoint_of, pushed_of, revision_of, weights_of
+from vlagents_ray.evaluate.results.summary import pushed_of, stated
 
 PROTOCOL = "protocol"  # key of an env's description: the constants of its benchmark
 _SETTINGS = ("env_options", "reset_options", "clock")
@@ -90,8 +90,8 @@ def configuration(results: Results) -> Configuration:
 
 
 def _identity(cell: CellResults) -> list[str]:
-    commit = revision_of(cell)
-    found = (checkpoint_of(cell), commit and f"commit {commit}", weights_of(cell), pushed_of(cell))
+    commit = stated(cell, "revision")
+    found = (stated(cell, "checkpoint"), commit and f"commit {commit}", stated(cell, "weights"), pushed_of(cell))
     return [one for one in found if one is not None]
 
 

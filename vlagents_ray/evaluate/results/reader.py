@@ -13,7 +13,7 @@ from typing import Any, Literal
 
 from vlagents_ray.errors import ConfigError
 from vlagents_ray.evaluate.artifacts.storage import inside, require_below
-from vlagents_ray.evaluate.episode.records import EpisodeResult
+from vlagents_ray.evaluate.episode.records import EpisodeResult, WorkerInfo
 from vlagents_ray.evaluate.plan.cases import contender
 from vlagents_ray.evaluate.plan.config import StopConfig
 from vlagents_ray.evaluate.plan.jobs import EpisodeKey
@@ -63,17 +63,11 @@ class Attempt:
 
 
 @dataclass(frozen=True, slots=True)
-class Worker:
+class Worker(WorkerInfo):
     """A worker's connection to a policy or creation of an env; a worker may have several entries."""
 
     run: int
     at: float  # seconds since 1970
-    host: str
-    node: str | None  # Ray's id
-    pid: int
-    policy: str
-    transport: str
-    renderer: str | None  # of its env
 
 
 @dataclass(frozen=True, slots=True)

@@ -7,7 +7,7 @@ import re
 from collections.abc import Iterable, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal, get_args
 
 import numpy as np
 
@@ -19,6 +19,7 @@ from vlagents_ray.evaluate.results.statistics import Rate
 
 FILE = "summary.json"
 TOTAL = "total"
+Stated = Literal["checkpoint", "weights", "revision"]  # of an episode's result
 
 
 @dataclass(frozen=True, slots=True)
@@ -131,7 +132,7 @@ class Summary:
         """Return the content of summary.json."""
         cells = [
             group.to_json()
-            | {"checkpoint": checkpoint_of(cell), "weights": weights_of(cell), "revision": revision_of(cell)}
+            | {what: stated(cell, what) for what in get_args(Stated)}
             | {"pushed_weights": pushed_of(cell)}
             | {"settings": cell.settings, "env": cell.env}
             | {"described": cell.described, "contract": cell.contract, "code": cell.code}
@@ -169,19 +170,10 @@ def summarize(results: Results) -> Summary:
     )
 
 
-def checkpoint_of(cell: CellResults) -> str | None:
-    """Return the checkpoint of a cell's episodes; None if no reset named one."""
-    return next((one.checkpoint for one in cell.counted if one.checkpoint is not None), None)
-
-
-def weights_of(cell: CellResults) -> str | None:
-    """Return the digest of the weights of a cell's episodes; None if no server reported it."""
-    return next((one.weights for one in cell.counted if one.weights is not None), None)
-
-
-def revision_of(cell: CellResults) -> str | None:
-    """Return the hub's commit of these weights; None if they are not from the hub's cache."""
-    return next((one.revision for one in cell.counted if one.revision is not None), None)
+def stated(cell: CellResults, what: Stated) -> str | None:
+    """Return the checkpoint, the digest of the weights, or the weights' commit on the hub; None if none was stated."""
+    found: list[str | None] = [getattr(one, what) for one in cell.counted]
+    return next((one for one in found if one is not None), None)
 
 
 def pushed_of(cell: CellResults) -> str | None:
