@@ -23,8 +23,15 @@ from vlagents_ray.evaluate.plan.config import (
 )
 from vlagents_ray.evaluate.results.comparison import Comparison, compare
 from vlagents_ray.evaluate.results.reader import Results, synchronous_twin
-from vlagents_ray.evaluate.results.statistics import Pairs, Rate, difference_interval, holm, mcnemar, wilson
-from vlagents_ray.evaluate.results.stopping import confidence_sequence
+from vlagents_ray.evaluate.results.statistics import (
+    Pairs,
+    Rate,
+    confidence_sequence,
+    difference_interval,
+    holm,
+    mcnemar,
+    wilson,
+)
 from vlagents_ray.evaluate.results.summary import Group, Summary
 
 if TYPE_CHECKING:

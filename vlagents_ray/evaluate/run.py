@@ -23,7 +23,7 @@ from vlagents_ray.evaluate.report.page import FILE as REPORT
 from vlagents_ray.evaluate.report.page import write_report
 from vlagents_ray.evaluate.report.terminal import Progress
 from vlagents_ray.evaluate.results.reader import Results, rate_of
-from vlagents_ray.evaluate.results.stopping import Stopping
+from vlagents_ray.evaluate.results.statistics import Stopping
 from vlagents_ray.evaluate.results.store import Store
 from vlagents_ray.evaluate.results.summary import Summary, summarize, write_summary
 from vlagents_ray.evaluate.trackers import TrackerFeed

@@ -1,6 +1,6 @@
 """`report.html`: an evaluation as one self-contained page.
 
-Python computes the content: this module, `success`, `episodes` and `provenance`, with the geometry of `charts`.
+Python computes the content: this module, `success` and `episodes`, with the geometry of `charts`.
 `templates/page.html.j2` is the page, `sections.html.j2` has a macro for each of its sections, `elements.html.j2` and
 `charts.html.j2` have their common parts. `report.css` and `report.js` are written into the page.
 """
@@ -8,18 +8,20 @@ Python computes the content: this module, `success`, `episodes` and `provenance`
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache, partial
 from importlib.resources import files
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import yaml
 from jinja2 import Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup
 
 from vlagents_ray.evaluate.artifacts.storage import storing, whole
 from vlagents_ray.evaluate.episode.records import EpisodeResult
+from vlagents_ray.evaluate.plan.config import EvalConfig
 from vlagents_ray.evaluate.report import charts
 from vlagents_ray.evaluate.report.charts import (
     BarChart,
@@ -32,10 +34,10 @@ from vlagents_ray.evaluate.report.charts import (
     quantity,
 )
 from vlagents_ray.evaluate.report.episodes import AT_ONCE, Gallery, episodes, errors, failures
-from vlagents_ray.evaluate.report.provenance import configuration, protocol, repeat
 from vlagents_ray.evaluate.report.success import compare_all, learning_curves, real_time_gaps, success_table
-from vlagents_ray.evaluate.results.reader import Results, by_timing, rate_of
-from vlagents_ray.evaluate.results.summary import Summary, median, summarize
+from vlagents_ray.evaluate.results.changes import Change
+from vlagents_ray.evaluate.results.reader import CellResults, Results, Run, by_timing, rate_of
+from vlagents_ray.evaluate.results.summary import Summary, median, pushed_of, stated, summarize
 
 FILE = "report.html"
 STAGES = {  # of `act.info["timing"]`, in their order
@@ -194,3 +196,117 @@ def latency(summary: Summary) -> Latency | None:
 def _stages(episodes: Sequence[EpisodeResult]) -> dict[str, float]:
     found = {stage: median(one.timing_ms.get(key) for one in episodes) for key, stage in STAGES.items()}
     return {stage: spent for stage, spent in found.items() if spent is not None}
+
+
+PROTOCOL = "protocol"  # key of an env's description: the constants of its benchmark
+_SETTINGS = ("env_options", "reset_options", "clock")
+
+
+@dataclass(frozen=True, slots=True)
+class Env:
+    """Envs with equal descriptions, and their contract."""
+
+    tasks: list[str]
+    constants: Mapping[str, Any] | None  # of the benchmark
+    described: Mapping[str, Any]
+    settings: Mapping[str, Any]
+    contract: str | None  # as YAML
+
+
+@dataclass(frozen=True, slots=True)
+class Configuration:
+    """Runs, workers, versions, the metadata of each policy's server, and all settings."""
+
+    runs: tuple[Run, ...]
+    changes: list[Change]  # of files or weights, between episodes
+    programs: list[tuple[str, Mapping[str, str]]]  # (env, digests of its files)
+    checkpoints: list[tuple[str, str]]  # (policy id, checkpoint, commit, digest or version of its weights)
+    workers: list[tuple[str, str, str, str, int]]  # (host, policy, transport, renderer, workers)
+    versions: list[Mapping[str, Any]]  # of each folder
+    policies: list[tuple[str, str]]  # (name, metadata as YAML)
+    settings: list[tuple[str, str]]  # (folder, settings as YAML)
+
+
+@dataclass(frozen=True, slots=True)
+class Again:
+    """The settings of a run as a file, without policies made by Python code."""
+
+    yaml: str
+    lacks_a_policy: bool
+
+
+@dataclass(frozen=True, slots=True)
+class Repeat:
+    """The arguments of the commands that repeat the evaluation and this page."""
+
+    runs: list[Again]
+    folders: list[str]
+
+
+def protocol(results: Results) -> list[Env]:
+    """Return the description and contract of the envs; envs with the same ones are one entry."""
+    alike: dict[str, tuple[CellResults, list[str]]] = {}
+    for cell in results.cells:
+        settings = {name: cell.settings.get(name) for name in _SETTINGS}
+        same = json.dumps([cell.described, cell.contract, settings], sort_keys=True)
+        alike.setdefault(same, (cell, []))[1].append(cell.task)
+    return [_env(cell, list(dict.fromkeys(tasks))) for cell, tasks in alike.values()]
+
+
+def configuration(results: Results) -> Configuration:
+    """Return the software and the machines that made the results."""
+    named = [(cell.contender, one) for cell in results.cells for one in _identity(cell)]
+    workers: dict[tuple[str, str, str, str], set[tuple[int, int]]] = {}
+    for one in results.workers:
+        where = (one.host, one.policy, one.transport, one.renderer or "none")
+        workers.setdefault(where, set()).add((one.run, one.pid))
+    last = _last_runs(results)
+    return Configuration(
+        results.runs,
+        results.accepted_changes,
+        list({cell.env: (cell.env, cell.program) for cell in results.cells if cell.program}.values()),
+        list(dict.fromkeys(named)),
+        [(*where, len(alike)) for where, alike in sorted(workers.items())],
+        [{name: value for name, value in run.versions.items() if value is not None} for run in last],
+        [(name, _yaml(metadata)) for name, metadata in results.policies.items()],
+        [(str(run.config.get("out")), _yaml(run.config)) for run in last],
+    )
+
+
+def _identity(cell: CellResults) -> list[str]:
+    commit = stated(cell, "revision")
+    found = (stated(cell, "checkpoint"), commit and f"commit {commit}", stated(cell, "weights"), pushed_of(cell))
+    return [one for one in found if one is not None]
+
+
+def repeat(results: Results) -> Repeat:
+    """Return the commands that repeat the evaluation."""
+    folders = list(dict.fromkeys(str(run.config.get("out")) for run in results.runs))
+    return Repeat([_again(run) for run in _last_runs(results)], folders)
+
+
+def _env(cell: CellResults, tasks: list[str]) -> Env:
+    described = dict(cell.described)
+    constants = described.pop(PROTOCOL, None)
+    settings = {name: value for name in _SETTINGS if (value := cell.settings.get(name))}
+    contract = _yaml(cell.contract) if cell.contract else None
+    return Env(tasks, constants if isinstance(constants, Mapping) else None, described, settings, contract)
+
+
+def _last_runs(results: Results) -> list[Run]:
+    """Return the last run of each folder; earlier runs had the same settings, as far as results depend on them."""
+    return list({run.config.get("out"): run for run in results.runs}.values())
+
+
+def _again(run: Run) -> Again:
+    """Return the settings as a file, without addresses of policies that were served for the run."""
+    config = EvalConfig.model_validate(run.config)
+    document = config.model_dump(mode="json", exclude_defaults=True, exclude={"out", "resume", "accept_changes"})
+    for policy in document["policies"]:
+        if policy.get("source") is not None:
+            policy.pop("url", None)
+    return Again(_yaml(document), any(not {"source", "url"} & policy.keys() for policy in document["policies"]))
+
+
+def _yaml(value: Any) -> str:
+    return str(yaml.safe_dump(value, sort_keys=False, allow_unicode=True, width=100)).rstrip()

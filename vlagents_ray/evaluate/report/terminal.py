@@ -20,8 +20,7 @@ from vlagents_ray.evaluate.plan.jobs import Job
 from vlagents_ray.evaluate.report.page import FILE as REPORT
 from vlagents_ray.evaluate.results.comparison import Comparison, clock_gaps
 from vlagents_ray.evaluate.results.database import RUNNING
-from vlagents_ray.evaluate.results.statistics import Rate
-from vlagents_ray.evaluate.results.stopping import confidence_sequence
+from vlagents_ray.evaluate.results.statistics import Rate, confidence_sequence
 from vlagents_ray.evaluate.results.summary import Group, Summary, cause_of, errors_of_policies, pushed_of
 
 LINE_EVERY_S = 5.0

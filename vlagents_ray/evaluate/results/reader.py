@@ -19,8 +19,7 @@ from vlagents_ray.evaluate.plan.config import StopConfig
 from vlagents_ray.evaluate.plan.jobs import EpisodeKey
 from vlagents_ray.evaluate.results.changes import Change
 from vlagents_ray.evaluate.results.database import FILE, RUNNING, is_locked, read_only, require_readable
-from vlagents_ray.evaluate.results.statistics import Rate
-from vlagents_ray.evaluate.results.stopping import Stopping, pooled
+from vlagents_ray.evaluate.results.statistics import Rate, Stopping, pooled
 
 KILLED = "killed"  # the state of a run that ended without saying so
 

@@ -32,7 +32,7 @@ from vlagents_ray.evaluate.plan.config import EvalConfig, canonical
 from vlagents_ray.evaluate.plan.jobs import EpisodeKey
 from vlagents_ray.evaluate.results.changes import changed
 from vlagents_ray.evaluate.results.database import FILE as RESULTS
-from vlagents_ray.evaluate.results.stopping import Stopping
+from vlagents_ray.evaluate.results.statistics import Stopping
 from vlagents_ray.evaluate.results.store import Store
 from vlagents_ray.evaluate.results.summary import Summary
 from vlagents_ray.evaluate.robot.operator import Operator, Verdict, VisibleTrial, save_start, start_pictures
