@@ -232,7 +232,8 @@ def to_host(groups: Iterable[Mapping[str, Any]], moved: list[tuple[Any, Any]]) -
     The tensors stay the same objects, with the same views and ties; until `from_host` they must not be read. After an
     error, the list has those that were moved.
     """
-    tensors = [value for named in groups for value in named.values() if _is_tensor(value) and _on_gpu(value)]
+    values = [value for named in groups for value in named.values()]
+    tensors = [value for value in values if _is_tensor(value) and value.device.type != "cpu"]
     storages = {value.untyped_storage().data_ptr(): value.untyped_storage() for value in tensors if value.numel()}
     for storage in storages.values():
         if storage.resizable():  # otherwise it belongs to another library or process
@@ -247,10 +248,6 @@ def from_host(moved: list[tuple[Any, Any]]) -> None:
         storage.resize_(host.nbytes())
         storage.copy_(host)
         moved.pop()
-
-
-def _on_gpu(value: Any) -> bool:
-    return bool(value.device.type != "cpu")
 
 
 # Checks that pushed values fit those of a policy, and a digest of values.

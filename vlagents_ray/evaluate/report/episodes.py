@@ -103,8 +103,14 @@ class Gallery:
 
     def cards(self, found: Sequence[Found], most: int) -> list[Card]:
         """Return at most `most` of these episodes with a video, from tasks and policies in turns."""
-        drawn = (self._card(cell, one) for cell, one in _in_turns(found))
-        return list(itertools.islice(filter(None, drawn), most))
+        drawn = (
+            (cell, one, player)
+            for cell, one in _in_turns(found)
+            if (
+                player := self.player(one.videos[0], f"{cell.task}, episode {one.result.key.episode}, {cell.contender}")
+            )
+        )
+        return list(itertools.islice(drawn, most))
 
     def player(self, video: str, label: str) -> Player | None:
         """Return a player for `video`, a path of an episode; None if the file is missing."""
@@ -121,11 +127,6 @@ class Gallery:
         """Return the page's link to the file; None without one."""
         path = self._file(video)
         return None if path is None else quote(Path(os.path.relpath(path, self._page.parent.resolve())).as_posix())
-
-    def _card(self, cell: CellResults, episode: Episode) -> Card | None:
-        label = f"{cell.task}, episode {episode.result.key.episode}, {cell.contender}"
-        player = self.player(episode.videos[0], label)
-        return None if player is None else (cell, episode, player)
 
     def _file(self, video: str) -> Path | None:
         try:

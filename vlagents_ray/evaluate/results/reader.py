@@ -19,7 +19,7 @@ from vlagents_ray.evaluate.plan.config import StopConfig
 from vlagents_ray.evaluate.plan.jobs import EpisodeKey
 from vlagents_ray.evaluate.results.changes import Change
 from vlagents_ray.evaluate.results.database import FILE, RUNNING, is_locked, read_only, require_readable
-from vlagents_ray.evaluate.results.statistics import Rate, Stopping, pooled
+from vlagents_ray.evaluate.results.statistics import Rate, Stopping, place_in_plan, pooled
 
 KILLED = "killed"  # the state of a run that ended without saying so
 
@@ -264,7 +264,8 @@ def _cell(row: dict[str, Any], episodes: tuple[Episode, ...], attempts: tuple[At
     names = ("settings", "described", "contract", "code", "program")
     parsed = {name: json.loads(row[name] or "{}") for name in names}
     each = row["planned"] // len(seeds)
-    episodes = tuple(replace(one, beyond=not _is_planned(one.result.key, seeds, each)) for one in episodes)
+    # After a resumption with fewer episodes, the others that were already played would be a biased selection.
+    episodes = tuple(replace(one, beyond=place_in_plan(one.result.key, seeds, each) is None) for one in episodes)
     stop, stopped_at = None, None
     if rule is not None:
         stop = StopConfig.model_validate_json(rule)
@@ -273,14 +274,6 @@ def _cell(row: dict[str, Any], episodes: tuple[Episode, ...], attempts: tuple[At
         stopped_at = stopping.at
         episodes = tuple(replace(one, beyond=one.beyond or not stopping.counts(one.result.key)) for one in episodes)
     return CellResults(**row | parsed, episodes=episodes, attempts=attempts, stop=stop, stopped_at=stopped_at)
-
-
-def _is_planned(key: EpisodeKey, seeds: Sequence[int], each: int) -> bool:
-    """Return whether an episode is still planned.
-
-    After a resumption with fewer episodes, the others that were already played would be a biased selection.
-    """
-    return key.episode < each and key.seed - key.episode in seeds
 
 
 def _run(row: dict[str, Any]) -> Run:

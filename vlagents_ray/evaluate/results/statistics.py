@@ -299,7 +299,7 @@ class Stopping:
 
     def add(self, result: EpisodeResult) -> None:
         """Add the outcome of an episode. One that failed by infrastructure has none yet, and is awaited."""
-        place = self._place(result.key)
+        place = place_in_plan(result.key, self._seeds, self._each)
         if place is not None and result.success_once is not None:
             self._outcomes[place] = result.success_once
         while self.at is None and self._begun in self._outcomes:
@@ -310,20 +310,19 @@ class Stopping:
 
     def counts(self, key: EpisodeKey) -> bool:
         """Return whether the episode counts, as it comes before the end of the cell."""
-        place = self._place(key)
+        place = place_in_plan(key, self._seeds, self._each)
         return self.at is None or (place is not None and place < self.at)
-
-    def _place(self, key: EpisodeKey) -> int | None:
-        """Return the index of an episode in the cell's part of `jobs.plan`; None if it is no longer planned."""
-        first = key.seed - key.episode
-        if first not in self._seeds or key.episode >= self._each:
-            return None
-        return self._seeds.index(first) * self._each + key.episode
 
     def _certain(self) -> bool:
         low, high = confidence_sequence(self._successes, self._begun, self._stop.error_rate)
         target, width = self._stop.target, self._stop.width
         return (target is not None and not low <= target <= high) or (width is not None and high - low < width)
+
+
+def place_in_plan(key: EpisodeKey, seeds: Sequence[int], each: int) -> int | None:
+    """Return the index of an episode in its cell's part of `jobs.plan`; None if it is no longer planned."""
+    first = key.seed - key.episode
+    return seeds.index(first) * each + key.episode if first in seeds and key.episode < each else None
 
 
 def _boundary(possible: Callable[[float], bool], inside: float, outside: float) -> float:
