@@ -282,9 +282,34 @@ def print_plan(config: EvalConfig) -> None:
     config, _ = resolve_policies(config, ask=False)
     results = Results.load(config.out) if (config.out / FILE).is_file() else None
     found = forecasts(cells(config), results)
-    out.print(_table(found))
-    for line in _sum(config, found):
-        out.print(line)
+    shown = Table(box=SIMPLE_HEAD, padding=0, pad_edge=False)
+    for title in ("policy", "env"):
+        shown.add_column(title, overflow="fold")
+    for title in ("seeds", "episodes", "finished", "to play", "s each", "time"):
+        shown.add_column(title, justify="right", no_wrap=True)
+    for one in found:
+        shown.add_row(
+            one.cell.contender,
+            " ".join(filter(None, one.cell.name[1:])),
+            str(len(one.cell.suite.seeds)),
+            str(one.cell.planned),
+            str(one.finished),
+            str(one.left),
+            "?" if one.seconds is None else f"{one.seconds:.3g}",
+            "?" if one.seconds is None else _time(one.left * one.seconds),
+        )
+    out.print(shown)
+    cases = [one.cell for one in found]
+    policies, envs = len({case.contender for case in cases}), len({(case.suite.name, case.env) for case in cases})
+    planned, finished = sum(case.planned for case in cases), sum(one.finished for one in found)
+    left = sum(one.left for one in found)
+    # Workers share one queue, so that at most one episode's time is lost at the end.
+    seconds = sum(one.left * (one.seconds or 0.0) for one in found) / max(1, min(config.workers, left))
+    unknown = sum(one.seconds is None for one in found)
+    beside = f", and {unknown} cells whose envs were not played yet" if unknown else ""
+    out.print(f"{len(found)} cells: {policies} policies at their checkpoints x {envs} environments of suites")
+    out.print(f"{planned} episodes, {finished} of them finished in {config.out}, {left} to play")
+    out.print(f"{_time(seconds)} with {config.workers} workers, as long as episodes before{beside}")
 
 
 def forecasts(planned: Sequence[EvalCase], results: Results | None) -> list[Forecast]:
@@ -302,42 +327,6 @@ def forecasts(planned: Sequence[EvalCase], results: Results | None) -> list[Fore
         mean = sum(seconds) / len(seconds) if seconds else None
         found.append(Forecast(cell, finished, 0 if has_stopped else cell.planned - finished, mean))
     return found
-
-
-def _table(found: list[Forecast]) -> Table:
-    shown = Table(box=SIMPLE_HEAD, padding=0, pad_edge=False)
-    for title in ("policy", "env"):
-        shown.add_column(title, overflow="fold")
-    for title in ("seeds", "episodes", "finished", "to play", "s each", "time"):
-        shown.add_column(title, justify="right", no_wrap=True)
-    for one in found:
-        shown.add_row(
-            one.cell.contender,
-            " ".join(filter(None, one.cell.name[1:])),
-            str(len(one.cell.suite.seeds)),
-            str(one.cell.planned),
-            str(one.finished),
-            str(one.left),
-            "?" if one.seconds is None else f"{one.seconds:.3g}",
-            "?" if one.seconds is None else _time(one.left * one.seconds),
-        )
-    return shown
-
-
-def _sum(config: EvalConfig, found: list[Forecast]) -> list[str]:
-    cases = [one.cell for one in found]
-    policies, envs = len({case.contender for case in cases}), len({(case.suite.name, case.env) for case in cases})
-    planned, finished = sum(case.planned for case in cases), sum(one.finished for one in found)
-    left = sum(one.left for one in found)
-    # Workers share one queue, so that at most one episode's time is lost at the end.
-    seconds = sum(one.left * (one.seconds or 0.0) for one in found) / max(1, min(config.workers, left))
-    unknown = sum(one.seconds is None for one in found)
-    beside = f", and {unknown} cells whose envs were not played yet" if unknown else ""
-    return [
-        f"{len(found)} cells: {policies} policies at their checkpoints x {envs} environments of suites",
-        f"{planned} episodes, {finished} of them finished in {config.out}, {left} to play",
-        f"{_time(seconds)} with {config.workers} workers, as long as episodes before{beside}",
-    ]
 
 
 def _time(seconds: float) -> str:

@@ -175,14 +175,12 @@ def _add_episodes(merged: _Merged, folder: Path, db: sqlite3.Connection) -> list
         known = merged.episodes.get(row["key"])
         if known is None or (known["status"] == "infra_failed" and row["status"] != "infra_failed"):
             merged.episodes[row["key"]], merged.home[row["key"]] = row, folder
-        elif row["status"] != "infra_failed" and (odd := _differences(known, row)):
-            conflicts.append(f"{row['key']}: {odd} in {merged.home[row['key']]} and {folder}")
+        elif row["status"] != "infra_failed":
+            before, now = (episode_of(dict(one)).result.outcome for one in (known, row))
+            odd = [f"{name} is {before[name]!r} and {now[name]!r}" for name in before if before[name] != now[name]]
+            if odd:
+                conflicts.append(f"{row['key']}: {', '.join(odd)} in {merged.home[row['key']]} and {folder}")
     return conflicts
-
-
-def _differences(known: Row, row: Row) -> str:
-    before, now = episode_of(dict(known)).result.outcome, episode_of(dict(row)).result.outcome
-    return ", ".join(f"{name} is {before[name]!r} and {now[name]!r}" for name in before if before[name] != now[name])
 
 
 def _require_one_checkpoint(merged: _Merged, *, weights_may_differ: bool) -> None:
@@ -265,7 +263,11 @@ def combined(folders: Sequence[Results]) -> Results:
     runs: list[Run] = []
     policies: dict[str, dict[str, Any]] = {}
     workers: list[Worker] = []
-    for each, label in zip(folders, _labels(folders, base), strict=True):
+    # The folders' last parts or, if some are the same, their paths under `base`.
+    labels = [each.out.resolve().name for each in folders]
+    if len(set(labels)) < len(labels):
+        labels = [str(each.out.resolve().relative_to(base)) for each in folders]
+    for each, label in zip(folders, labels, strict=True):
         names = {
             cell.policy: f"{cell.policy} ({label})" if cell.policy in clashing else cell.policy for cell in each.cells
         }
@@ -301,14 +303,6 @@ def _of_other_weights(folders: Sequence[Results]) -> set[str]:
         if weights is not None and first.setdefault((cell.contender, checkpoint), weights) != weights:
             found.add(cell.policy)
     return found
-
-
-def _labels(folders: Sequence[Results], base: Path) -> list[str]:
-    """Return names of the folders: their last parts, or their paths under `base` if last parts are the same."""
-    names = [each.out.resolve().name for each in folders]
-    if len(set(names)) == len(names):
-        return names
-    return [str(each.out.resolve().relative_to(base)) for each in folders]
 
 
 def _moved(cell: CellResults, policy: str, prefix: Path, runs_before: int) -> CellResults:

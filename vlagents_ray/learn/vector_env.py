@@ -202,7 +202,13 @@ class BatchVectorEnv(vector.VectorEnv):  # type: ignore[misc]
         Returns:
             The observations, rewards (N,) float64, terminated (N,) bool, truncated (N,) bool, and the infos.
         """
-        self._require_begun()
+        if not self._seen:
+            raise NotReset("step before reset; call reset(seed=...) first")
+        if self._over.any() and self._autoreset == vector.AutoresetMode.DISABLED:
+            raise NotReset(
+                f"environments {np.flatnonzero(self._over).tolist()} are over, and autoreset is disabled; call "
+                f"reset(options={{'reset_mask': ...}})"
+            )
         rows = np.asarray(actions, np.float32)
         if rows.shape != self.action_space.shape:
             raise InvalidAction(f"actions: got {rows.shape}, want {self.action_space.shape}, a row an environment")
@@ -286,15 +292,6 @@ class BatchVectorEnv(vector.VectorEnv):  # type: ignore[misc]
         if self._observation == "state":
             return np.stack(rows)
         return {name: np.stack([row[name] for row in rows]) for name in self.single_observation_space}
-
-    def _require_begun(self) -> None:
-        if not self._seen:
-            raise NotReset("step before reset; call reset(seed=...) first")
-        if self._over.any() and self._autoreset == vector.AutoresetMode.DISABLED:
-            raise NotReset(
-                f"environments {np.flatnonzero(self._over).tolist()} are over, and autoreset is disabled; call "
-                f"reset(options={{'reset_mask': ...}})"
-            )
 
 
 def _seeds(seeds: Sequence[int | None], which: np.ndarray) -> list[int]:

@@ -76,12 +76,9 @@ class _CountedProgress(Progress):
 
     def __init__(self, console: Console) -> None:
         self._console = console
-        self._start([], {}, 0)
+        _CountedProgress.begin(self, [], {}, 0)
 
     def begin(self, cells: Sequence[EvalCase], recorded: Mapping[str, Rate], left: int) -> None:
-        self._start(cells, recorded, left)
-
-    def _start(self, cells: Sequence[EvalCase], recorded: Mapping[str, Rate], left: int) -> None:
         self._started = monotonic()
         self._cells = {cell.fingerprint: cell for cell in cells}
         self._rates = {cell: recorded.get(cell, Rate(0, 0)) for cell in self._cells}
@@ -272,15 +269,11 @@ def print_summary(console: Console, summary: Summary) -> None:
     if not all(part.success_once.pooled for part in parts):
         lines.append("cells that stopped after different numbers of episodes have no rate in common: quote each alone")
     lines += [_gap(one) for one in clock_gaps(summary.results)]
-    if summary.state == RUNNING:
-        lines.append("still running")
-    elif summary.state != "complete":
-        lines.append(f"{summary.state}: go on with --resume")
+    if summary.state != "complete":
+        lines.append("still running" if summary.state == RUNNING else f"{summary.state}: go on with --resume")
     lines.append(f"results: {summary.out}")
-    if (summary.out / REPORT).is_file():
-        lines.append(f"report: {summary.out / REPORT}")
-    if (summary.out / "videos").is_dir():
-        lines.append(f"videos: {summary.out / 'videos'}")
+    written = {"report": summary.out / REPORT, "videos": summary.out / "videos"}
+    lines += [f"{name}: {path}" for name, path in written.items() if path.exists()]
     for line in lines:
         console.print(line, markup=False, highlight=False, soft_wrap=True)
 

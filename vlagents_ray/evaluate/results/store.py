@@ -22,9 +22,9 @@ from vlagents_ray.evaluate.plan.cases import EvalCase, cells
 from vlagents_ray.evaluate.plan.config import EvalConfig, canonical
 from vlagents_ray.evaluate.plan.jobs import Job
 from vlagents_ray.evaluate.results.changes import (
-    IDENTITY,
     MIX,
     Change,
+    changed,
     listed,
     policy_changes,
     policy_program,
@@ -55,7 +55,6 @@ class Store:
             StorageFailed: The folder cannot be written to.
         """
         self.cells = cells(config)
-        self._pushed = {cell.fingerprint: cell.policy.pushed_weights for cell in self.cells}
         self._out = config.out
         with storing(config.out):
             self._out.mkdir(parents=True, exist_ok=True)
@@ -144,7 +143,7 @@ class Store:
             insert(self._db, "episodes", row)
 
     def _require_pushed_weights(self, result: EpisodeResult) -> None:
-        want = self._pushed.get(result.key.settings)
+        want = self._cell[result.key.settings].policy.pushed_weights
         if want is None or result.policy_version is None:
             return
         acted = (result.first_policy_version, result.policy_version, result.policy_fingerprint)
@@ -261,8 +260,7 @@ class Store:
         known = None if row is None else json.loads(row[0])
         swept = any(cell.step is not None for cell in self.cells if cell.policy.name == name)
         if known is not None:
-            what = next((one for one in IDENTITY[: 1 if swept else 2] if known.get(one) != metadata.get(one)), None)
-            if what is not None:
+            if (what := changed(known, metadata, swept=swept)) in ("policy", "checkpoint"):
                 raise ConfigError(
                     f"policy {name!r}: the server has {what} {metadata.get(what)!r}, the results in {self._out} are of "
                     f"{known.get(what)!r}; serve that one again, or choose another out folder"
@@ -303,10 +301,10 @@ class Store:
             )
         found = [f"- {text}" for cell in self.cells for text in _differences(db, cell)]
         if found:
+            odd = "\n".join(found)
             raise ConfigError(
-                f"{self._out} has results of other settings:\n"
-                + "\n".join(found)
-                + "\ntake the old settings, or choose another out folder"
+                f"{self._out} has results of other settings:\n{odd}\n"
+                f"take the old settings, or choose another out folder"
             )
         lacking, programs = self._other_plan(db), self._other_programs(db)
         self._accept_or_raise(
@@ -324,7 +322,7 @@ class Store:
         A trainer evaluates versions of policies one after the other into one folder, each with its plan, so cells of
         other policies are not missing.
         """
-        trained = all(self._pushed.values())
+        trained = all(cell.policy.pushed_weights for cell in self.cells)
         policies = {cell.policy.name for cell in self.cells}
         mine = {(cell.policy.name, cell.suite.name, cell.env) for cell in self.cells}
         rows = db.execute("SELECT DISTINCT policy, suite, env FROM cells WHERE cell IN (SELECT cell FROM episodes)")

@@ -87,11 +87,15 @@ class TrialLog:
             self.key = _key(config)
             self._file = self._path.open("a+b")
         try:
-            self._lock()
+            fcntl.flock(self._file, fcntl.LOCK_EX | fcntl.LOCK_NB)
             plan = canonical([[cell.fingerprint, *cell.name, cell.planned, cell.suite.seeds] for cell in cells])
             self._read(config, hmac.digest(self.key, plan.encode(), hashlib.sha256).hex())
-        except BaseException:
+        except BaseException as error:
             self._file.close()
+            if isinstance(error, BlockingIOError):
+                raise ConfigError(
+                    f"{self._path}: another evaluation is writing there; wait for it, or choose another folder"
+                ) from error
             raise
 
     def __enter__(self) -> TrialLog:
@@ -127,14 +131,6 @@ class TrialLog:
     def note_unblinded(self) -> None:
         """Record that the results were written before all trials were played."""
         self._write({"unblinded": time.time()})
-
-    def _lock(self) -> None:
-        try:
-            fcntl.flock(self._file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError as error:
-            raise ConfigError(
-                f"{self._path}: another evaluation is writing there; wait for it, or choose another folder"
-            ) from error
 
     def _read(self, config: EvalConfig, identity: str) -> None:
         self._file.seek(0)
@@ -357,16 +353,15 @@ class _RemainingTrials:
                 save_start(self._config.out, trial.place, self._robot.observe())
         self._log.begin(trial.number, attempt)
         try:
-            played = play(trial, self._robot, self._factory, self._operator, self._recording(trial, attempt))
+            name = f"trial{trial.number:04d}-{attempt}"
+            recording = None if self._config.record == "none" else self._config.out / RECORDINGS / name
+            played = play(trial, self._robot, self._factory, self._operator, recording)
         except VLAgentsError as error:
             failure = explain(error)
-            why = failure.message if failure.code == "env_failed" else f"it could not be played ({failure.code})"
-            self._log.end(
-                trial.number,
-                attempt,
-                {"again": why, "cause": "worker" if failure.code == "env_failed" else "policy"},
-                dataclasses.asdict(failure),
-            )
+            why, cause = f"it could not be played ({failure.code})", "policy"
+            if failure.code == "env_failed":
+                why, cause = failure.message, "worker"
+            self._log.end(trial.number, attempt, {"again": why, "cause": cause}, dataclasses.asdict(failure))
             return
         self._require_same_policy(trial, played)
         if played.result.status == "policy_error":
@@ -416,11 +411,6 @@ class _RemainingTrials:
             start=start_pictures(self._config.out, trial.place),
             message=f"played again: {again}" if again else self._message,
         )
-
-    def _recording(self, trial: Trial, attempt: int) -> Path | None:
-        if self._config.record == "none":
-            return None
-        return self._config.out / RECORDINGS / f"trial{trial.number:04d}-{attempt}"
 
     def _require_same_policy(self, trial: Trial, played: PlayedTrial) -> None:
         """Raise `ConfigError` if the policy has changed, without naming the policy or its trials."""
@@ -477,15 +467,11 @@ def _write_results(config: EvalConfig, planned: Sequence[EvalCase], log: TrialLo
             trial = trials[logged.trial - 1]
             job = dataclasses.replace(trial.job, attempt=logged.attempt)
             if not logged.finished:
-                store.record_attempt(job, _failure(logged), retried=True)
+                by_operator = logged.seen["cause"] == "operator"
+                again = Failure("operator", "trial_repeated", logged.seen["again"])
+                store.record_attempt(job, again if by_operator else Failure(**logged.sealed), retried=True)
                 continue
             if logged.sealed["metadata"]:
                 store.note_policy(trial.job.cell.policy.name, logged.sealed["metadata"])
             store.record(result_of(trial, logged), logged.attempt, finished=logged.at)
         return conclude(config, store, state)
-
-
-def _failure(logged: LoggedTrial) -> Failure:
-    if logged.seen["cause"] == "operator":
-        return Failure("operator", "trial_repeated", logged.seen["again"])
-    return Failure(**logged.sealed)
