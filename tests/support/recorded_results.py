@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from contextlib import closing
 from pathlib import Path
 from typing import Any
 
@@ -94,7 +95,7 @@ def _trouble(store: Store, job: Job, *, lost: bool) -> None:
 
 
 def _video() -> dict[str, bytes]:
-    with VideoRecorder(10.0) as recorder:
+    with closing(VideoRecorder(10.0)) as recorder:
         for shade in range(0, 250, 50):
             recorder.add(Obs(cameras={"front": np.full((32, 48, 3), shade, np.uint8)}))
         return recorder.finish()

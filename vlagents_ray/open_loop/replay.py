@@ -214,9 +214,7 @@ class OpenLoopResult:
         }
 
 
-def replay(
-    folder: Path, sessions: Sessions, plan: ReplayPlan, progress: Callable[[int, int], None] = lambda *_: None
-) -> OpenLoopResult:
+def replay(folder: Path, sessions: Sessions, plan: ReplayPlan) -> OpenLoopResult:
     """Query a policy at each frame, and compare its actions with the dataset's.
 
     A session is reset with its first recorded observation, its instruction and its options, and then receives each of
@@ -261,7 +259,6 @@ def replay(
             agent.close()
         with lock:
             result.sessions += 1
-            progress(result.sessions, len(plays))
 
     with ThreadPoolExecutor(plan.at_once, "open-loop") as threads:
         futures = [threads.submit(one, play) for play in plays]

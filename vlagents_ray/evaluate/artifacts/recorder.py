@@ -16,7 +16,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from typing_extensions import Self
 
 from vlagents_ray.errors import ConfigError, EnvFailed, InvalidObservation
 from vlagents_ray.evaluate.artifacts.storage import (
@@ -47,7 +46,7 @@ class Footage:
 
 
 class VideoRecorder:
-    """Videos of one episode, one for each camera. Use as a context manager, whose end frees the encoders."""
+    """Videos of one episode, one for each camera. `close` frees the encoders."""
 
     def __init__(self, fps: float | None = None) -> None:
         self._fps = fps or DEFAULT_FPS
@@ -76,12 +75,6 @@ class VideoRecorder:
     def close(self) -> None:
         while self._tracks:
             self._tracks.popitem()[1][1].abandon()
-
-    def __enter__(self) -> VideoRecorder:
-        return self
-
-    def __exit__(self, *exc: object) -> None:
-        self.close()
 
 
 def save_videos(out: Path, cell: EvalCase, result: EpisodeResult, videos: dict[str, bytes]) -> list[str]:
@@ -230,7 +223,7 @@ class Artifacts:
 
 
 class EpisodeRecorder(EpisodeObserver):
-    """Records one episode. Use as a context manager, which frees its resources. This class records nothing."""
+    """Records one episode. This class records nothing."""
 
     @property
     def wants_images(self) -> EpisodeChoice:
@@ -241,11 +234,8 @@ class EpisodeRecorder(EpisodeObserver):
         """Return the artifacts of an episode with this result; `second_pass` renders missing images."""
         return Artifacts()
 
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *exc: object) -> None:
-        pass
+    def close(self) -> None:
+        """Free the recorder's resources."""
 
 
 RecorderFactory = Callable[[EvalConfig, float | None], EpisodeRecorder]  # called with the env's control_hz
@@ -297,7 +287,7 @@ class Recording(EpisodeRecorder):
         if self._wants_video != "none" or self._wants_trajectory != "none":
             self._video.add(obs)
 
-    def __exit__(self, *exc: object) -> None:
+    def close(self) -> None:
         self._video.close()
 
 

@@ -23,16 +23,7 @@ from vlagents_ray.evaluate.artifacts.storage import storing, whole
 from vlagents_ray.evaluate.episode.records import EpisodeResult
 from vlagents_ray.evaluate.plan.config import EvalConfig
 from vlagents_ray.evaluate.report import charts
-from vlagents_ray.evaluate.report.charts import (
-    BarChart,
-    bar_chart,
-    duration,
-    interval,
-    interval_name,
-    number,
-    percent,
-    quantity,
-)
+from vlagents_ray.evaluate.report.charts import BarChart, duration, interval, number, percent, quantity
 from vlagents_ray.evaluate.report.episodes import AT_ONCE, Gallery, episodes, errors, failures
 from vlagents_ray.evaluate.report.success import compare_all, learning_curves, real_time_gaps, success_table
 from vlagents_ray.evaluate.results.changes import Change
@@ -133,7 +124,7 @@ def _solved(summary: Summary) -> Figure:
         name += f", {timing}"
     once = part.success_once
     if once.pooled:
-        return Figure(f"{percent(once)} %", name, f"{interval_name(once)} {interval(once)} %")
+        return Figure(f"{percent(once)} %", name, f"{charts.interval_name(once)} {interval(once)} %")
     cells = by_timing(summary.results.of(best))[timing]
     rates = [rate for cell in cells if (rate := rate_of([cell], "success_once")).rate is not None]
     low, high = (percent(pick(rates, key=lambda rate: rate.rate or 0.0)) for pick in (min, max))
@@ -189,7 +180,7 @@ def latency(summary: Summary) -> Latency | None:
         )
         for name, counted in played.items()
     ]
-    chart = bar_chart(bars, "One act of the policy, by stage") if bars else None
+    chart = charts.bar_chart(bars, "One act of the policy, by stage") if bars else None
     return Latency(chart, stages, rows, summary.transports, len(timed))
 
 

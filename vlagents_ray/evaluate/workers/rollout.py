@@ -157,7 +157,8 @@ class Rollout:
             require_match(agent.contract, env.contract)
             found["worker"] = _worker_info(cell.policy.name, agent, env)
         with contextlib.ExitStack() as stack:
-            recordings = [stack.enter_context(self._recorders(self._config, env.contract.control_hz)) for _ in jobs]
+            made = (self._recorders(self._config, env.contract.control_hz) for _ in jobs)
+            recordings = [stack.enter_context(contextlib.closing(one)) for one in made]
             outcomes = self._play(agent, env, jobs, recordings)
             return [
                 Report(result=one, artifacts=self._finished(env, job, one, recording))
