@@ -87,14 +87,22 @@ def choose(points: Sequence[MeasuredPoint], goal: TuningGoal) -> MeasuredPoint:
     A variant must be 5 % better than one with fewer changes, or serve more robots.
     """
     reaching = [point for point in points if point.reaches(goal)]
+    if not reaching and not points:
+        raise GoalMissed("no settings could be measured")
     if not reaching:
-        raise GoalMissed(_nearest(points, goal))
+        found = min(points, key=lambda point: point.p99_ms)
+        raise GoalMissed(
+            f"--p99-ms: got {goal.p99_ms}; the shortest p99 of a round trip was {found.p99_ms:.1f} ms, with "
+            f"{sessions(found.sessions)} and {found.variant.name}; raise --p99-ms, or use a faster machine or model"
+        )
     variants = sorted({point.variant.name: point.variant for point in reaching}.values(), key=lambda v: len(v.changes))
     reached = lambda point: point.actions_per_s if goal.kind == "throughput" else point.sessions  # noqa: E731
     best, *others = (max((one for one in reaching if one.variant is variant), key=reached) for variant in variants)
     for other in others:
-        if _is_better(other, best, goal):
-            best = other
+        is_better = other.actions_per_s > _BETTER * best.actions_per_s
+        if goal.kind == "robots":
+            is_better = (other.sessions, 0.0) > (best.sessions, other.p99_ms * _BETTER - best.p99_ms)
+        best = other if is_better else best
     return best
 
 
@@ -126,22 +134,6 @@ def figures(points: Sequence[MeasuredPoint]) -> list[list[str]]:
         numbers = [f"{one.actions_per_s:.1f}", f"{one.round_trip_ms:.1f}", f"{one.p99_ms:.1f}", f"{one.peak_mib:.0f}"]
         rows.append([one.variant.name, str(one.sessions), *numbers, f"{one.difference:.3%}"])
     return rows
-
-
-def _is_better(one: MeasuredPoint, other: MeasuredPoint, goal: TuningGoal) -> bool:
-    if goal.kind == "throughput":
-        return one.actions_per_s > _BETTER * other.actions_per_s
-    return (one.sessions, 0.0) > (other.sessions, one.p99_ms * _BETTER - other.p99_ms)
-
-
-def _nearest(points: Sequence[MeasuredPoint], goal: TuningGoal) -> str:
-    if not points:
-        return "no settings could be measured"
-    found = min(points, key=lambda point: point.p99_ms)
-    return (
-        f"--p99-ms: got {goal.p99_ms}; the shortest p99 of a round trip was {found.p99_ms:.1f} ms, with "
-        f"{sessions(found.sessions)} and {found.variant.name}; raise --p99-ms, or use a faster machine or model"
-    )
 
 
 _RISING = 1.05  # factor by which two larger batches must raise the rate before a still larger one is measured
@@ -348,7 +340,13 @@ class Tuner:
         try:
             difference = largest_difference(self._actions(process, size), self._wanted)
             if difference > self._plan.tolerance:
-                raise VariantFailed(self._refusal(difference, itself=not variant.changes and not found))
+                off = f"actions differ by {difference:.2%} of their range, want at most {self._plan.tolerance:.2%}"
+                if variant.changes or found:
+                    raise VariantFailed(f"refused, as {off}")
+                raise VariantFailed(
+                    f"{off}, for the same observations and seeds, so that nothing can be compared with them; let the "
+                    f"seed of `reset` determine what is random in the policy, or raise --tolerance"
+                )
             measured = TunedSize(variant, size, difference)
             measured.add(self._turn(process, size))
         except VariantFailed as error:
@@ -362,25 +360,14 @@ class Tuner:
         self._progress(f"{variant.name}, {sessions(size)}: {measured.rates[0]:.1f} actions/s")
         return True
 
-    def _refusal(self, difference: float, *, itself: bool) -> str:
-        off = f"actions differ by {difference:.2%} of their range, want at most {self._plan.tolerance:.2%}"
-        if itself:
-            return (
-                f"{off}, for the same observations and seeds, so that nothing can be compared with them; let the seed "
-                f"of `reset` determine what is random in the policy, or raise --tolerance"
-            )
-        return f"refused, as {off}"
-
     def _actions(self, process: LineProcess, size: int) -> list[np.ndarray]:
-        said = self._request(process, {"act": size})
+        process.send(json.dumps({"act": size}))
+        said = self._answer(process)
         return [np.array(action, np.float64) for action in said["actions"]]
 
     def _turn(self, process: LineProcess, number: int) -> dict[str, Any]:
         rank = "robot" if self._plan.goal.kind == "robots" else "simulation"
-        return self._request(process, {"measure": number, "seconds": self._plan.seconds, "rank": rank})
-
-    def _request(self, process: LineProcess, asked: Mapping[str, Any]) -> dict[str, Any]:
-        process.send(json.dumps(asked))
+        process.send(json.dumps({"measure": number, "seconds": self._plan.seconds, "rank": rank}))
         return self._answer(process)
 
     def _answer(self, process: LineProcess) -> dict[str, Any]:

@@ -97,10 +97,13 @@ def _serve(settings: ProcessSettings, answer: Callable[[Mapping[str, Any]], None
     )
     with measured:
         uncompiled = measured.engine.models.uncompiled
+        dtypes = [] if jax_device() is None else ["bfloat16"]  # that the accelerator computes without emulation
+        if (used := cuda()) is not None:
+            dtypes = ["bfloat16" if used.get_device_capability() >= (8, 0) else "float16"]
         answer({
             "device": device_name(), "load_s": measured.load_s, "uncompiled": uncompiled,
-            "settings": _settings_of(agent), "dtypes": _native_dtypes(),
-            "modes": [False, True] if cuda() is None else [False, "graphs", True],  # of `compile`
+            "settings": _settings_of(agent), "dtypes": dtypes,
+            "modes": [False, True] if used is None else [False, "graphs", True],  # of `compile`
         })  # fmt: skip
         for line in sys.stdin:
             try:
@@ -141,13 +144,6 @@ def _settings_of(agent: Agent) -> dict[str, Any]:
         agent = agent.agent
     config = getattr(agent, "config", None)
     return {name: getattr(config, name) for name in _TUNED if name in getattr(type(config), "model_fields", {})}
-
-
-def _native_dtypes() -> list[str]:
-    """Return the 16-bit types in which the policy's accelerator computes without emulation."""
-    if (used := cuda()) is not None:
-        return ["bfloat16" if used.get_device_capability() >= (8, 0) else "float16"]
-    return [] if jax_device() is None else ["bfloat16"]
 
 
 def _sentence(error: BaseException) -> str:

@@ -24,7 +24,6 @@ from vlagents_ray.evaluate import (
     EvalConfig,
     EvaluationInterrupted,
     OutOfTime,
-    PolicyConfig,
     Progress,
     Results,
     Summary,
@@ -227,7 +226,13 @@ def watch_training(
 
 def _watched(config: EvalConfig) -> tuple[int, str]:
     """Find the index of the policy that is trained, and the pattern of its checkpoints."""
-    found = {place: pattern for place, one in enumerate(config.policies) if (pattern := _pattern(one)) is not None}
+    found = {}
+    for place, policy in enumerate(config.policies):
+        settings: dict[str, Any] = {CHOICE: policy.checkpoint}
+        if policy.source is not None and "://" not in policy.source:
+            settings |= own_settings(policy_deployment(policy, policy.source, step_follows=True).applications[0])
+        if isinstance(pattern := settings[CHOICE], str) and STEP in pattern:
+            found[place] = pattern
     if len(found) != 1:
         raise ConfigError(
             f"--watch: got {STEP} in the checkpoints of {len(found)} policies, want it in that of one, such as "
@@ -237,14 +242,6 @@ def _watched(config: EvalConfig) -> tuple[int, str]:
     if config.policies[place].steps:
         raise ConfigError(f"policy {config.policies[place].name!r}: --watch finds its steps; leave `steps` out")
     return place, pattern
-
-
-def _pattern(policy: PolicyConfig) -> str | None:
-    settings: dict[str, Any] = {CHOICE: policy.checkpoint}
-    if policy.source is not None and "://" not in policy.source:
-        settings |= own_settings(policy_deployment(policy, policy.source, step_follows=True).applications[0])
-    checkpoint = settings[CHOICE]
-    return checkpoint if isinstance(checkpoint, str) and STEP in checkpoint else None
 
 
 def _at(config: EvalConfig, place: int, steps: list[int]) -> EvalConfig:

@@ -51,7 +51,12 @@ def served(config: EvalConfig, address: str | None = None, *, replica_per_gpu: b
         config, parts = resolve_policies(config)
         # Raise errors before anything starts.
         if address is None:
-            _require_gpus(config)
+            wanted = max(cell.worker.gpus for cell in cells(config))
+            if wanted and wanted > (here := gpus_here()):  # Ray would never start these workers here
+                raise ConfigError(
+                    f"worker.gpus: a worker wants {wanted:g} GPUs, this machine has {here:g}; want less (0 draws in "
+                    f"software), or the --address of a cluster that has them"
+                )
             for part in parts.values():
                 require_packages(part)
         if config.real_robot is None:
@@ -64,16 +69,6 @@ def served(config: EvalConfig, address: str | None = None, *, replica_per_gpu: b
             cpus = max(os.cpu_count() or 1, math.ceil(config.workers * most_cpus(config)))
             stack.enter_context(running_server(together(parts), address=address, num_cpus=cpus, ingress=False))
         yield config
-
-
-def _require_gpus(config: EvalConfig) -> None:
-    """Raise `ConfigError` if workers need more GPUs than this machine has: Ray would never start them here."""
-    wanted = max(cell.worker.gpus for cell in cells(config))
-    if wanted and wanted > (here := gpus_here()):
-        raise ConfigError(
-            f"worker.gpus: a worker wants {wanted:g} GPUs, this machine has {here:g}; want less (0 draws in software), "
-            f"or the --address of a cluster that has them"
-        )
 
 
 def _require_match(config: EvalConfig, parts: Mapping[str, ServeDeploySchema]) -> None:
@@ -128,12 +123,7 @@ def _found(policy: PolicyConfig, url: str) -> dict[str, Any]:
     """Request the served policy: a result belongs to it, not to an address."""
     if policy.config:
         raise ConfigError(f"policy {policy.name!r}: got {sorted(policy.config)}, but {url} has its settings already")
-    said = _metadata(url)
+    with RemoteAgent(url, connect_timeout_s=_STARTING_S) as agent:  # its server may be starting
+        said = agent.metadata
     name = policy.name if "name" in policy.model_fields_set else said["policy"]
     return {"name": name, "config": said.get("config", {}), "checkpoint": said.get("checkpoint")}
-
-
-def _metadata(url: str) -> dict[str, Any]:
-    """Request the metadata of a server, which may be starting."""
-    with RemoteAgent(url, connect_timeout_s=_STARTING_S) as agent:
-        return agent.metadata

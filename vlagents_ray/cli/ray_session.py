@@ -60,7 +60,11 @@ def quiet_ray(name: str | None, started: threading.Event | None = None) -> Itera
     Yields:
         The log file, which stays unless it is empty and which this user alone can read; None without one.
     """
-    file, kept = _file(name) if name is not None else (None, None)
+    file = kept = None
+    if name is not None:
+        descriptor, path = tempfile.mkstemp(prefix=f"{name}-", suffix=".log")
+        os.close(descriptor)
+        file, kept = Path(path), RotatingFileHandler(path, maxBytes=_FILE_BYTES, backupCount=1)
     terminal = _Terminal(kept, started)
     loggers = [logging.getLogger(one) for one in LOGGERS]
     for logger in loggers:
@@ -171,12 +175,6 @@ class _LogFile:
 
 def _is_problem(text: str, level: int) -> bool:
     return level >= logging.WARNING and not any(one in text for one in _MEANT)
-
-
-def _file(name: str) -> tuple[Path, logging.Handler]:
-    descriptor, path = tempfile.mkstemp(prefix=f"{name}-", suffix=".log")
-    os.close(descriptor)
-    return Path(path), RotatingFileHandler(path, maxBytes=_FILE_BYTES, backupCount=1)
 
 
 @contextlib.contextmanager

@@ -182,7 +182,11 @@ def replay_command(
             from vlagents_ray.open_loop.replay import ReplayPlan
 
             chosen = None if episodes is None else parse_episodes(episodes)
-            names = Names(_renamed(cameras), None if state is None else parse_list(state))
+            pairs = [part.partition("=") for part in parse_list(cameras or "")]
+            if odd := [name for name, equals, _ in pairs if not equals]:
+                raise ConfigError(f"--cameras: got {odd[0]!r}, want POLICY=DATASET, such as base=top,wrist=wrist_left")
+            renamed = {name: camera for name, _, camera in pairs}
+            names = Names(renamed, None if state is None else parse_list(state))
             plan = ReplayPlan(chosen, horizon, every, at_once, names)
             replay_dataset(folder, policy, out_dir or fresh(Path("runs/replay")), plan)
             return
@@ -237,10 +241,3 @@ def parse_episodes(text: str) -> Sequence[int]:
             raise ConfigError(f"--episodes: got {part!r}, want numbers and ranges, such as 0-9,12")
         found += range(int(first), int(last or first) + 1)
     return found
-
-
-def _renamed(text: str | None) -> dict[str, str]:
-    pairs = [part.partition("=") for part in parse_list(text or "")]
-    if odd := [name for name, equals, _ in pairs if not equals]:
-        raise ConfigError(f"--cameras: got {odd[0]!r}, want POLICY=DATASET, such as base=top,wrist=wrist_left")
-    return {name: camera for name, _, camera in pairs}

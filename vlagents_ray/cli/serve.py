@@ -23,7 +23,6 @@ from vlagents_ray.serve.ports import EVERYWHERE, LOOPBACK
 if TYPE_CHECKING:
     from ray.serve.schema import ServeDeploySchema
 
-    from vlagents_ray.serve.config.deployment import ServerArgs
     from vlagents_ray.serve.launch.haproxy import Tls
 
 
@@ -131,7 +130,10 @@ def connection_lines(
         args = ServerArgs(**app.args)
         settings = ", ".join(f"{name}={value!r}" for name, value in own_settings(app).items())
         yield f"  policy: {args.policy}" + (f" ({settings})" if settings else "")
-        keyed = not insecure and (keys is not None or _wants_key(args))
+        keyed = not insecure
+        if keyed and keys is None:
+            with contextlib.suppress(ConfigError):  # the keys are on the cluster's machines
+                keyed = args.access.keys() is not None
         curl = 'curl -H "Authorization: Bearer $VLAGENTS_RAY_API_KEY" ' if keyed else ""
         yield f"  how to talk to it: {curl}{url}/docs"
         if not (insecure or args.access.insecure):  # --insecure shows no live page
@@ -139,13 +141,6 @@ def connection_lines(
         for name, one in describe(args.dialects).items():
             places = [one["address"]] if "address" in one else [_address(url, path) for path in one["paths"]]
             yield f"  {name}: {', '.join(places)}"
-
-
-def _wants_key(args: ServerArgs) -> bool:
-    try:
-        return args.access.keys() is not None
-    except ConfigError:  # the keys are on the cluster's machines
-        return True
 
 
 def _address(url: str, path: str) -> str:
