@@ -145,7 +145,11 @@ def unpack(archive: Path, folder: Path, *, most_bytes: int = MOST_BYTES) -> tupl
             target.parent.mkdir(parents=True, exist_ok=True)
             with file.open(member) as source, target.open("xb") as written:
                 found[name] = _copy(archive, source, written, member)
-    return manifest, sha256, _differences(manifest.files, found)
+    stated = manifest.files
+    odd = [f"{name} is not in the bundle" for name in stated.keys() - found.keys()]
+    odd += [f"{name} is not in the manifest" for name in found.keys() - stated.keys()]
+    odd += [f"{name} has another digest" for name in stated.keys() & found.keys() if stated[name] != found[name]]
+    return manifest, sha256, sorted(odd)
 
 
 @contextmanager
@@ -215,13 +219,6 @@ def _copy(archive: Path, source: IO[bytes], target: IO[bytes], member: zipfile.Z
     return FileDigest(sha256=sha256.hexdigest(), size=size)
 
 
-def _differences(stated: dict[str, FileDigest], found: dict[str, FileDigest]) -> list[str]:
-    odd = [f"{name} is not in the bundle" for name in stated.keys() - found.keys()]
-    odd += [f"{name} is not in the manifest" for name in found.keys() - stated.keys()]
-    odd += [f"{name} has another digest" for name in stated.keys() & found.keys() if stated[name] != found[name]]
-    return sorted(odd)
-
-
 def write_bundle(folder: Path, archive: Path, *, videos: bool = False) -> str:
     """Write the results in `folder` as one file that others can check (`verify`).
 
@@ -248,7 +245,12 @@ def write_bundle(folder: Path, archive: Path, *, videos: bool = False) -> str:
             with reading(folder) as source, closing(sqlite3.connect(stage / DATABASE)) as target:
                 source.backup(target)
             _link_files(folder, stage, Results.load(stage), videos=videos)
-            _name_what_is_there(stage)
+            # Remove the names of files that are not in the bundle.
+            with closing(sqlite3.connect(stage / DATABASE)) as db, db:
+                for key, shown, numbers in db.execute("SELECT key, videos, trajectory FROM episodes").fetchall():
+                    there = [path for path in json.loads(shown) if (stage / path).is_file()]
+                    values = canonical(there), numbers if numbers and (stage / numbers).is_file() else None, key
+                    db.execute("UPDATE episodes SET videos = ?, trajectory = ? WHERE key = ?", values)
             return pack(stage, archive)
 
 
@@ -268,15 +270,6 @@ def _link_files(folder: Path, stage: Path, results: Results, *, videos: bool) ->
         source = inside(folder, path)
         if source.is_file():  # a folder that was copied without its videos can be bundled
             link_or_copy(source, stage / path)
-
-
-def _name_what_is_there(stage: Path) -> None:
-    """Remove the names of files that are not in the bundle."""
-    with closing(sqlite3.connect(stage / DATABASE)) as db, db:
-        for key, videos, trajectory in db.execute("SELECT key, videos, trajectory FROM episodes").fetchall():
-            there = [path for path in json.loads(videos) if (stage / path).is_file()]
-            numbers = trajectory if trajectory is not None and (stage / trajectory).is_file() else None
-            db.execute("UPDATE episodes SET videos = ?, trajectory = ? WHERE key = ?", (canonical(there), numbers, key))
 
 
 Verdict = Literal["equal", "differs", "other here", "not checked"]
@@ -374,7 +367,18 @@ def _check(folder: Path, replay: int, *, trust: bool) -> Iterator[Finding]:
     write_report(results, folder / REPORT)
     yield _check_trajectories(results)
     yield _check_versions(results)
-    yield from _check_replays(results, replay, trust=trust)
+    if not replay:
+        yield Finding("replay", "not checked", "was not asked for (--replay 0)")
+        return
+    # The first episode with a recording of each cell in turns, then the second of each, and so on.
+    by_cell = [[(cell, one) for one in cell.episodes if one.result.status == "done"] for cell in results.cells]
+    turns = (pair for turn in zip_longest(*by_cell) for pair in turn if pair is not None)
+    found = ((*pair, trajectory) for pair in turns if (trajectory := _recorded(results, pair[1])) is not None)
+    chosen = list(islice(found, replay))
+    if not chosen:
+        yield Finding("replay", "not checked", "no finished episode has a recording (eval --record all)")
+    for cell, episode, trajectory in chosen:
+        yield _replay(cell, episode, trajectory, trust=trust)
 
 
 def _check_cells(results: Results) -> Finding:
@@ -566,26 +570,6 @@ def _is_plain(value: object) -> bool:
     if isinstance(value, str):
         return _WORD.fullmatch(value) is not None
     return value is None or isinstance(value, bool | int | float)
-
-
-def _check_replays(results: Results, most: int, *, trust: bool) -> Iterator[Finding]:
-    """Play the recorded actions of up to `most` episodes, of as many cells as possible."""
-    if not most:
-        yield Finding("replay", "not checked", "was not asked for (--replay 0)")
-        return
-    chosen = _chosen(results, most)
-    if not chosen:
-        yield Finding("replay", "not checked", "no finished episode has a recording (eval --record all)")
-    for cell, episode, trajectory in chosen:
-        yield _replay(cell, episode, trajectory, trust=trust)
-
-
-def _chosen(results: Results, most: int) -> list[tuple[CellResults, Episode, Trajectory]]:
-    """Return the first episode with a recording of each cell in turns, then the second of each, and so on."""
-    by_cell = [[(cell, one) for one in cell.episodes if one.result.status == "done"] for cell in results.cells]
-    turns = (pair for turn in zip_longest(*by_cell) for pair in turn if pair is not None)
-    found = ((*pair, trajectory) for pair in turns if (trajectory := _recorded(results, pair[1])) is not None)
-    return list(islice(found, most))
 
 
 def _replay(cell: CellResults, episode: Episode, trajectory: Trajectory, *, trust: bool) -> Finding:

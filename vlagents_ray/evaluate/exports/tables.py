@@ -85,7 +85,9 @@ COLUMNS = (
     _of_result("transport", "string", "transport of the observations"),
     _of_episode("attempts", "integer", "1, and one more for each failure of infrastructure"),
     _of_episode("run", "integer", "number of the run over the plan, from 1"),
-    Column("finished", "time", "when it was recorded", lambda _cell, episode: _time(episode.finished)),
+    Column(
+        "finished", "time", "when it was recorded", lambda _, one: datetime.fromtimestamp(one.finished, timezone.utc)
+    ),
     _of_episode("videos", "json", "paths in the folder of results"),
     _of_episode("trajectory", "string", "path in the folder of results"),
     _of_result("revision", "string", "the hub's commit of the checkpoint, if it was loaded from the hub's cache"),
@@ -99,10 +101,6 @@ def rows(results: Results) -> Iterator[dict[str, Any]]:
     for cell in results.cells:
         for episode in cell.episodes:
             yield {column.name: column.value(cell, episode) for column in COLUMNS}
-
-
-def _time(seconds: float) -> datetime:
-    return datetime.fromtimestamp(seconds, timezone.utc)
 
 
 _JSON = {column.name for column in COLUMNS if column.type == "json"}
