@@ -8,7 +8,7 @@ Python computes the content: this module, `success` and `episodes`, with the geo
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cache, partial
 from importlib.resources import files
@@ -20,7 +20,6 @@ from jinja2 import Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup
 
 from vlagents_ray.evaluate.artifacts.storage import storing, whole
-from vlagents_ray.evaluate.episode.records import EpisodeResult
 from vlagents_ray.evaluate.plan.config import EvalConfig
 from vlagents_ray.evaluate.report import charts
 from vlagents_ray.evaluate.report.charts import BarChart, duration, interval, number, percent, quantity
@@ -77,7 +76,13 @@ def write_report(results: Results, path: Path, *, inline: bool = False) -> Path:
 
 def report(summary: Summary, gallery: Gallery) -> str:
     """Return the page as text."""
-    results = summary.results
+    results, total = summary.results, summary.total
+    figures = [
+        _solved(summary),
+        Figure(number(total.episodes, 0), "episodes", f"of {number(total.planned, 0)} planned"),
+        Figure(number(total.steps, 0), "env steps", f"{number(summary.steps_per_second)} a second"),
+        Figure(duration(summary.wall_seconds), "wall time", f"{quantity(total.retries, 'attempt')} repeated"),
+    ]
     sections = [
         Section("Success", "success", success_table(summary)),
         Section("Comparison", "comparison", compare_all(summary)),
@@ -99,20 +104,10 @@ def report(summary: Summary, gallery: Gallery) -> str:
             policies=list(dict.fromkeys(cell.policy for cell in results.cells)),
             tasks=len({(cell.suite, cell.env) for cell in results.cells}),
             run=results.runs[-1],
-            figures=_figures(summary),
+            figures=figures,
             sections=[one for one in sections if one.view],
         )
     )
-
-
-def _figures(summary: Summary) -> list[Figure]:
-    total = summary.total
-    return [
-        _solved(summary),
-        Figure(number(total.episodes, 0), "episodes", f"of {number(total.planned, 0)} planned"),
-        Figure(number(total.steps, 0), "env steps", f"{number(summary.steps_per_second)} a second"),
-        Figure(duration(summary.wall_seconds), "wall time", f"{quantity(total.retries, 'attempt')} repeated"),
-    ]
 
 
 def _solved(summary: Summary) -> Figure:
@@ -163,7 +158,10 @@ def latency(summary: Summary) -> Latency | None:
     played = {name: counted for name, counted in by_name.items() if counted}
     if not played:
         return None
-    spent = {name: _stages(counted) for name, counted in played.items()}
+    spent: dict[str, dict[str, float]] = {}
+    for name, counted in played.items():
+        known = {stage: median(one.timing_ms.get(key) for one in counted) for key, stage in STAGES.items()}
+        spent[name] = {stage: ms for stage, ms in known.items() if ms is not None}
     timed = {name: found for name, found in spent.items() if found}
     bars = dict(list(timed.items())[:MOST_BARS])
     stages = [stage for stage in STAGES.values() if any(stage in found for found in timed.values())]
@@ -182,11 +180,6 @@ def latency(summary: Summary) -> Latency | None:
     ]
     chart = charts.bar_chart(bars, "One act of the policy, by stage") if bars else None
     return Latency(chart, stages, rows, summary.transports, len(timed))
-
-
-def _stages(episodes: Sequence[EpisodeResult]) -> dict[str, float]:
-    found = {stage: median(one.timing_ms.get(key) for one in episodes) for key, stage in STAGES.items()}
-    return {stage: spent for stage, spent in found.items() if spent is not None}
 
 
 PROTOCOL = "protocol"  # key of an env's description: the constants of its benchmark
@@ -241,12 +234,24 @@ def protocol(results: Results) -> list[Env]:
         settings = {name: cell.settings.get(name) for name in _SETTINGS}
         same = json.dumps([cell.described, cell.contract, settings], sort_keys=True)
         alike.setdefault(same, (cell, []))[1].append(cell.task)
-    return [_env(cell, list(dict.fromkeys(tasks))) for cell, tasks in alike.values()]
+    envs = []
+    for cell, tasks in alike.values():
+        described = dict(cell.described)
+        constants = described.pop(PROTOCOL, None)
+        of_benchmark = constants if isinstance(constants, Mapping) else None
+        settings = {name: value for name in _SETTINGS if (value := cell.settings.get(name))}
+        contract = _yaml(cell.contract) if cell.contract else None
+        envs.append(Env(list(dict.fromkeys(tasks)), of_benchmark, described, settings, contract))
+    return envs
 
 
 def configuration(results: Results) -> Configuration:
     """Return the software and the machines that made the results."""
-    named = [(cell.contender, one) for cell in results.cells for one in _identity(cell)]
+    named: list[tuple[str, str]] = []
+    for cell in results.cells:
+        commit = stated(cell, "revision")
+        found = (stated(cell, "checkpoint"), commit and f"commit {commit}", stated(cell, "weights"), pushed_of(cell))
+        named += [(cell.contender, one) for one in found if one is not None]
     workers: dict[tuple[str, str, str, str], set[tuple[int, int]]] = {}
     for one in results.workers:
         where = (one.host, one.policy, one.transport, one.renderer or "none")
@@ -264,39 +269,24 @@ def configuration(results: Results) -> Configuration:
     )
 
 
-def _identity(cell: CellResults) -> list[str]:
-    commit = stated(cell, "revision")
-    found = (stated(cell, "checkpoint"), commit and f"commit {commit}", stated(cell, "weights"), pushed_of(cell))
-    return [one for one in found if one is not None]
-
-
 def repeat(results: Results) -> Repeat:
     """Return the commands that repeat the evaluation."""
     folders = list(dict.fromkeys(str(run.config.get("out")) for run in results.runs))
-    return Repeat([_again(run) for run in _last_runs(results)], folders)
-
-
-def _env(cell: CellResults, tasks: list[str]) -> Env:
-    described = dict(cell.described)
-    constants = described.pop(PROTOCOL, None)
-    settings = {name: value for name in _SETTINGS if (value := cell.settings.get(name))}
-    contract = _yaml(cell.contract) if cell.contract else None
-    return Env(tasks, constants if isinstance(constants, Mapping) else None, described, settings, contract)
+    runs = []
+    for run in _last_runs(results):  # without addresses of policies that were served for the run
+        config = EvalConfig.model_validate(run.config)
+        document = config.model_dump(mode="json", exclude_defaults=True, exclude={"out", "resume", "accept_changes"})
+        for policy in document["policies"]:
+            if policy.get("source") is not None:
+                policy.pop("url", None)
+        lacks_a_policy = any(not {"source", "url"} & policy.keys() for policy in document["policies"])
+        runs.append(Again(_yaml(document), lacks_a_policy))
+    return Repeat(runs, folders)
 
 
 def _last_runs(results: Results) -> list[Run]:
     """Return the last run of each folder; earlier runs had the same settings, as far as results depend on them."""
     return list({run.config.get("out"): run for run in results.runs}.values())
-
-
-def _again(run: Run) -> Again:
-    """Return the settings as a file, without addresses of policies that were served for the run."""
-    config = EvalConfig.model_validate(run.config)
-    document = config.model_dump(mode="json", exclude_defaults=True, exclude={"out", "resume", "accept_changes"})
-    for policy in document["policies"]:
-        if policy.get("source") is not None:
-            policy.pop("url", None)
-    return Again(_yaml(document), any(not {"source", "url"} & policy.keys() for policy in document["policies"]))
 
 
 def _yaml(value: Any) -> str:

@@ -130,13 +130,11 @@ class _CountedProgress(Progress):
         cells = list(self._cells)
         if len(cells) > MOST_ROWS:
             cells = [cell for cell in cells if 0 < done[cell] < self._cells[cell].planned][:MOST_ROWS]
-        return [
-            (self._name(cell), f"{done[cell]}/{self._cells[cell].planned}", str(self._rates[cell])) for cell in cells
-        ]
-
-    def _name(self, cell: str) -> str:
-        contender, suite, env = self._cells[cell].name
-        return " ".join(filter(None, ("" if self._alone else contender, suite, env)))
+        rows = []
+        for cell in cells:
+            name = " ".join(filter(None, self._cells[cell].name[self._alone :]))  # of one policy, without its id
+            rows.append((name, f"{done[cell]}/{self._cells[cell].planned}", str(self._rates[cell])))
+        return rows
 
     def _overall(self) -> str:
         elapsed_s = monotonic() - self._started
@@ -213,9 +211,12 @@ def seconds_left(episodes: int, played: int, elapsed_s: float) -> float | None:
 
 def results_table(summary: Summary) -> Table:
     """Make a table of success, length and speed: for each policy id a row for each env, and one for all together."""
-    names = summary.results.contenders
+    names, error_rate = summary.results.contenders, summary.total.success_once.error_rate
+    interval = "the Wilson 95 % interval"
+    if error_rate is not None:
+        interval = f"the confidence sequence of early stopping (error rate {error_rate:.2g})"
     table = Table(
-        title=f"{', '.join(names)}: success in %, with {_interval(summary.total)}",
+        title=f"{', '.join(names)}: success in %, with {interval}",
         box=SIMPLE_HEAD,
         padding=0,
         pad_edge=False,
@@ -243,9 +244,15 @@ def print_summary(console: Console, summary: Summary) -> None:
         summary: The result of `evaluate`.
     """
     console.print(results_table(summary))
-    if summary.total.policy_errors:
-        console.print(_errors_table(summary))
     total = summary.total
+    if total.policy_errors:
+        table = Table(title="Errors of policies", box=SIMPLE_HEAD, padding=0, pad_edge=False)
+        for title in ("policy", "env", "error"):
+            table.add_column(title, overflow="fold")
+        table.add_column("episodes", justify="right", no_wrap=True)
+        for (policy, task, error), number in errors_of_policies(summary.results):
+            table.add_row(policy, task, Text(error.strip().partition("\n")[0]), str(number))
+        console.print(table)
     speed = summary.rollout_steps_per_second
     lines = [f"{total.steps} steps in {summary.wall_seconds:.1f} s"]
     if speed is not None:
@@ -264,7 +271,9 @@ def print_summary(console: Console, summary: Summary) -> None:
     lines += [f"accepted change: {change}" for change in summary.results.accepted_changes]
     pushed = {cell.contender: words for cell in summary.results.cells if (words := pushed_of(cell)) is not None}
     lines += [f"{name}: weights pushed by a learner, {words}" for name, words in pushed.items()]
-    lines += [_stopped(group) for group in summary.cells if group.stopped]
+    for one in (group for group in summary.cells if group.stopped):
+        name, error_rate = " ".join(filter(None, (one.contender, one.suite, one.env))), one.success_once.error_rate or 0
+        lines.append(f"{name}: stopped after {one.episodes} of {one.planned} (error rate {100 * error_rate:.2g} %)")
     parts = [part for name in summary.results.contenders for part in summary.parts(name).values()]
     if not all(part.success_once.pooled for part in parts):
         lines.append("cells that stopped after different numbers of episodes have no rate in common: quote each alone")
@@ -276,29 +285,6 @@ def print_summary(console: Console, summary: Summary) -> None:
     lines += [f"{name}: {path}" for name, path in written.items() if path.exists()]
     for line in lines:
         console.print(line, markup=False, highlight=False, soft_wrap=True)
-
-
-def _errors_table(summary: Summary) -> Table:
-    table = Table(title="Errors of policies", box=SIMPLE_HEAD, padding=0, pad_edge=False)
-    for title in ("policy", "env", "error"):
-        table.add_column(title, overflow="fold")
-    table.add_column("episodes", justify="right", no_wrap=True)
-    for (policy, task, error), number in errors_of_policies(summary.results):
-        table.add_row(policy, task, Text(error.strip().partition("\n")[0]), str(number))
-    return table
-
-
-def _interval(total: Group) -> str:
-    error_rate = total.success_once.error_rate
-    if error_rate is None:
-        return "the Wilson 95 % interval"
-    return f"the confidence sequence of early stopping (error rate {error_rate:.2g})"
-
-
-def _stopped(group: Group) -> str:
-    name = " ".join(filter(None, (group.contender, group.suite, group.env)))
-    error_rate = group.success_once.error_rate
-    return f"{name}: stopped after {group.episodes} of {group.planned} (error rate {100 * (error_rate or 0):.2g} %)"
 
 
 def _gap(gap: Comparison) -> str:

@@ -14,7 +14,7 @@ import numpy as np
 from vlagents_ray.evaluate.artifacts.storage import whole
 from vlagents_ray.evaluate.episode.records import EpisodeResult
 from vlagents_ray.evaluate.results.comparison import gap_to_synchronous
-from vlagents_ray.evaluate.results.reader import CellResults, Results, Run, by_timing, rate_of
+from vlagents_ray.evaluate.results.reader import CellResults, Results, by_timing, rate_of
 from vlagents_ray.evaluate.results.statistics import Rate
 
 FILE = "summary.json"
@@ -161,12 +161,18 @@ class Summary:
 
 def summarize(results: Results) -> Summary:
     """Aggregate results, those of earlier runs included."""
+    wall_s = rollout_s = 0.0
+    for run in results.runs:
+        played = [one for cell in results.cells for one in cell.episodes if one.run == run.run]
+        last = max((one.finished for one in played), default=run.started)
+        wall_s += (last if run.ended is None else run.ended) - run.started  # a killed one ended with its last episode
+        rollout_s += last - min((one.finished - one.result.seconds for one in played), default=last)
     return Summary(
         results,
         tuple(group_of((cell.contender, cell.suite, cell.env), [cell]) for cell in results.cells),
         tuple(group_of((name, "", TOTAL), results.of(name)) for name in results.contenders),
-        wall_seconds=sum(_wall_seconds(results, run) for run in results.runs),
-        rollout_seconds=sum(_rollout_seconds(results, run) for run in results.runs),
+        wall_s,
+        rollout_s,
     )
 
 
@@ -255,21 +261,3 @@ def median(values: Iterable[float | None]) -> float | None:
 def _share(parts: Sequence[float | None], whole_s: float) -> float | None:
     known = [part for part in parts if part is not None]
     return sum(known) / whole_s if known and whole_s else None
-
-
-def _wall_seconds(results: Results, run: Run) -> float:
-    """Return the duration of a run; of a killed one, until its last episode."""
-    if run.ended is not None:
-        return run.ended - run.started
-    return max((finished for finished, _ in _played(results, run)), default=run.started) - run.started
-
-
-def _rollout_seconds(results: Results, run: Run) -> float:
-    played = _played(results, run)
-    return max(finished for finished, _ in played) - min(begun for _, begun in played) if played else 0.0
-
-
-def _played(results: Results, run: Run) -> list[tuple[float, float]]:
-    """Return the end and begin of each episode of a run, in seconds since 1970."""
-    mine = [one for cell in results.cells for one in cell.episodes if one.run == run.run]
-    return [(one.finished, one.finished - one.result.seconds) for one in mine]
