@@ -201,11 +201,17 @@ class TrackerFeed:
         with closing(sqlite3.connect(self._config.out / FILE, timeout=WAIT_S)) as db:
             logged = dict(db.execute("SELECT what, episodes FROM tracked WHERE tracker = ?", (name,)))
             for part, cells, group in _parts(results):
-                if not all(map(_complete, cells)) or logged.get(part) == group.episodes:
+                over = all(
+                    cell.stopped_at is not None or sum(not one.beyond for one in cell.episodes) >= cell.planned
+                    for cell in cells
+                )
+                if not over or logged.get(part) == group.episodes:
                     continue
                 run = self._run(name, results, cells[0].policy)
                 run.log(_metrics(group), cells[0].step)
-                if part == cells[0].cell and (videos := self._videos(cells[0])):
+                ordered = sorted(cells[0].episodes, key=lambda one: bool(one.result.success_once))
+                paths = [self._config.out / path for one in ordered for path in one.videos[:1]]
+                if part == cells[0].cell and (videos := paths[: self._config.tracking.videos]):
                     run.videos(_label(group), videos, cells[0].step)
                 with db:
                     db.execute("INSERT OR REPLACE INTO tracked VALUES (?, ?, ?)", (name, part, group.episodes))
@@ -229,11 +235,6 @@ class TrackerFeed:
             sorted((out / PROVENANCE).glob("*.diff")),
         )  # fmt: skip
 
-    def _videos(self, cell: CellResults) -> list[Path]:
-        ordered = sorted(cell.episodes, key=lambda one: bool(one.result.success_once))
-        paths = [self._config.out / path for one in ordered for path in one.videos[:1]]
-        return paths[: self._config.tracking.videos]
-
 
 def _parts(results: Results) -> list[tuple[str, list[CellResults], Group]]:
     """Return the groups that are logged together, as (key, cells, aggregates): each cell, then each policy id."""
@@ -241,10 +242,6 @@ def _parts(results: Results) -> list[tuple[str, list[CellResults], Group]]:
     alone = [(cell.cell, [cell], group) for cell, group in zip(results.cells, summary.cells, strict=True)]
     totals = zip(results.contenders, summary.totals, strict=True)
     return alone + [(contender, results.of(contender), group) for contender, group in totals]
-
-
-def _complete(cell: CellResults) -> bool:
-    return cell.stopped_at is not None or sum(not one.beyond for one in cell.episodes) >= cell.planned
 
 
 def _label(group: Group) -> str:

@@ -86,13 +86,16 @@ class Allocation:
     @classmethod
     def here(cls, environ: Mapping[str, str] = os.environ) -> Allocation:
         cpus = int(environ["SLURM_CPUS_ON_NODE"])
+        gpus = len([one for one in environ.get("SLURM_STEP_GPUS", "").split(",") if one])
+        # Slurm counts MiB, and 0 means all of the node's.
+        mebibytes = int(environ.get("SLURM_MEM_PER_NODE", "0")) or int(environ.get("SLURM_MEM_PER_CPU", "0")) * cpus
         return cls(
             job=int(environ["SLURM_JOB_ID"]),
             nodes=int(environ["SLURM_JOB_NUM_NODES"]),
             node=int(environ.get("SLURM_NODEID", "0")),
             cpus=min(cpus, len(os.sched_getaffinity(0))),  # a task may be bound to fewer
-            gpus=_gpus(environ),
-            memory=_memory(environ, cpus),
+            gpus=int(environ.get("SLURM_GPUS_ON_NODE", gpus)),
+            memory=mebibytes * 2**20 or None,
         )
 
     @property
@@ -116,18 +119,6 @@ class Allocation:
         # The other listeners use free ports, since Ray's defaults are the same numbers for every cluster.
         free = ["--min-worker-port=0", "--max-worker-port=0", "--dashboard-agent-listen-port=0"]
         return ["ray", "start", *where, *given, *free, f"--temp-dir={folder}/{FILES}", *_REST]
-
-
-def _gpus(environ: Mapping[str, str]) -> int:
-    if (count := environ.get("SLURM_GPUS_ON_NODE")) is not None:
-        return int(count)
-    return len([one for one in environ.get("SLURM_STEP_GPUS", "").split(",") if one])
-
-
-def _memory(environ: Mapping[str, str], cpus: int) -> int | None:
-    """Return the memory in bytes; Slurm counts MiB, and 0 means all of the node's."""
-    mebibytes = int(environ.get("SLURM_MEM_PER_NODE", "0")) or int(environ.get("SLURM_MEM_PER_CPU", "0")) * cpus
-    return mebibytes * 2**20 or None
 
 
 def run_node() -> int:

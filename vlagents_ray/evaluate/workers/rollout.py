@@ -30,7 +30,6 @@ from vlagents_ray.errors import ConfigError, EnvFailed, MissingDependency, VLAge
 from vlagents_ray.evaluate.artifacts.recorder import Artifacts, EpisodeRecorder, RecorderFactory, Recording
 from vlagents_ray.evaluate.episode.episode import (
     EpisodeSettings,
-    Outcome,
     Phase,
     options_of_reset,
     run_episodes,
@@ -155,11 +154,24 @@ class Rollout:
         agent, env = self._agent, self._env
         if found:
             require_match(agent.contract, env.contract)
-            found["worker"] = _worker_info(cell.policy.name, agent, env)
+            if (renderer := env.renderer()) is not None:
+                require_own(renderer)
+            name, where = None if renderer is None else renderer.name, (socket.gethostname(), this_node(), os.getpid())
+            found["worker"] = WorkerInfo(*where, cell.policy.name, transport_of(agent), name)
         with contextlib.ExitStack() as stack:
             made = (self._recorders(self._config, env.contract.control_hz) for _ in jobs)
             recordings = [stack.enter_context(contextlib.closing(one)) for one in made]
-            outcomes = self._play(agent, env, jobs, recordings)
+            wanted = recordings[0].wants_images
+            outcomes = run_episodes(
+                env,
+                agent,
+                self._sessions_of(agent, env, len(jobs)),
+                [job.key for job in jobs],
+                EpisodeSettings(cell.policy.execute, cell.suite.clock, cell.suite.reset_options, cell.policy_options),
+                observers=recordings,
+                watch=self._set_phase,
+                images=wanted == "all" or (wanted == "failures" and self._renders_at_once(agent, env, cell.policy)),
+            )
             return [
                 Report(result=one, artifacts=self._finished(env, job, one, recording))
                 if isinstance(one, EpisodeResult)
@@ -185,21 +197,6 @@ class Rollout:
         """
         rows = policy.execute or (agent.contract.chunk if agent.contract is not None else None)
         return rows == 1 or self._surplus < 0 or not self._repeatable or not isinstance(env, SequentialBatch)
-
-    def _play(
-        self, agent: Agent, env: BatchEnv, jobs: tuple[Job, ...], recordings: list[EpisodeRecorder]
-    ) -> list[Outcome]:
-        cell, wanted = jobs[0].cell, recordings[0].wants_images
-        return run_episodes(
-            env,
-            agent,
-            self._sessions_of(agent, env, len(jobs)),
-            [job.key for job in jobs],
-            EpisodeSettings(cell.policy.execute, cell.suite.clock, cell.suite.reset_options, cell.policy_options),
-            observers=recordings,
-            watch=self._set_phase,
-            images=wanted == "all" or (wanted == "failures" and self._renders_at_once(agent, env, cell.policy)),
-        )
 
     def _sessions_of(self, agent: Agent, env: BatchEnv, number: int) -> list[Agent]:
         if env.num_envs == 1:
@@ -270,15 +267,6 @@ class Rollout:
 
 def _metadata(agent: Agent) -> dict[str, Any]:
     return dict(getattr(agent, "metadata", {}))
-
-
-def _worker_info(policy: str, agent: Agent, env: BatchEnv) -> WorkerInfo:
-    """Return this process's entry in the results."""
-    renderer = env.renderer()
-    if renderer is not None:
-        require_own(renderer)
-    name = None if renderer is None else renderer.name
-    return WorkerInfo(socket.gethostname(), this_node(), os.getpid(), policy, transport_of(agent), name)
 
 
 def agents(config: EvalConfig, own: Callable[[], Agent] | None, rank: RankName = "simulation") -> AgentFactory:
