@@ -257,7 +257,11 @@ def combined(folders: Sequence[Results]) -> Results:
     every = [cell for each in folders for cell in each.cells]
     counts = Counter((cell.contender, cell.suite, cell.env) for cell in every)
     clashing = {cell.policy for cell in every if counts[cell.contender, cell.suite, cell.env] > 1}
-    clashing |= _of_other_weights(folders)
+    first: dict[tuple[str, str | None], str] = {}  # the weights by policy id and checkpoint
+    for cell in every:
+        weights, checkpoint = stated(cell, "weights"), stated(cell, "checkpoint")
+        if weights is not None and first.setdefault((cell.contender, checkpoint), weights) != weights:
+            clashing.add(cell.policy)
     base = Path(os.path.commonpath([each.out.resolve() for each in folders]))
     cells: list[CellResults] = []
     runs: list[Run] = []
@@ -272,7 +276,13 @@ def combined(folders: Sequence[Results]) -> Results:
             cell.policy: f"{cell.policy} ({label})" if cell.policy in clashing else cell.policy for cell in each.cells
         }
         prefix = each.out.resolve().relative_to(base)
-        cells += [_moved(cell, names[cell.policy], prefix, len(runs)) for cell in each.cells]
+        for cell in each.cells:
+            episodes = tuple(
+                replace(one, run=one.run + len(runs), videos=tuple(str(prefix / video) for video in one.videos))
+                for one in cell.episodes
+            )
+            attempts = tuple(replace(one, run=one.run + len(runs)) for one in cell.attempts)
+            cells.append(replace(cell, policy=names[cell.policy], episodes=episodes, attempts=attempts))
         policies |= {names.get(name, name): said for name, said in each.policies.items()}
         workers += [
             replace(one, policy=names.get(one.policy, one.policy), run=one.run + len(runs)) for one in each.workers
@@ -292,23 +302,3 @@ def _require_apart(folders: Sequence[Results]) -> None:
                     f"settings; put parts of one evaluation into one folder first: `vlagents-ray merge OUT {first} "
                     f"{each.out}`, with --accept-changes if code or weights changed between them"
                 )
-
-
-def _of_other_weights(folders: Sequence[Results]) -> set[str]:
-    """Return the policies with several weights under one checkpoint's name."""
-    first: dict[tuple[str, str | None], str] = {}  # by policy id and checkpoint
-    found = set()
-    for cell in (cell for each in folders for cell in each.cells):
-        weights, checkpoint = stated(cell, "weights"), stated(cell, "checkpoint")
-        if weights is not None and first.setdefault((cell.contender, checkpoint), weights) != weights:
-            found.add(cell.policy)
-    return found
-
-
-def _moved(cell: CellResults, policy: str, prefix: Path, runs_before: int) -> CellResults:
-    episodes = tuple(
-        replace(one, run=one.run + runs_before, videos=tuple(str(prefix / video) for video in one.videos))
-        for one in cell.episodes
-    )
-    attempts = tuple(replace(one, run=one.run + runs_before) for one in cell.attempts)
-    return replace(cell, policy=policy, episodes=episodes, attempts=attempts)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import shutil
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import islice
 from pathlib import Path
 from typing import Any
 
@@ -246,30 +247,28 @@ def _finished(one: _Demonstration, angles: Mapping[int, Centre], folder: Path) -
     """Return the episode in the dataset's form, after putting its videos into `folder`."""
     keys = camera_keys(one.videos)
     names = {key: camera for camera, key in keys.items()}
-    about = DatasetContract(_policy_contract(one), one.parts, names, angles, one.environment)
-    rows, features = _numbers(one, about)
-    images: dict[str, Stats] = {}
-    videos: dict[str, Path] = {}
-    for camera, video in one.videos.items():
-        key = keys[camera]
-        images[key], size = _statistics(video, len(one.actions))
-        features[key] = video_feature(*size, _fps(one.cell))
-        videos[key] = folder / f"{key}.mp4"
-        link_or_copy(video, videos[key])
-    return Finished(one.episode.result.instruction, features, rows, images, videos, about)
-
-
-def _policy_contract(one: _Demonstration) -> Contract:
-    """Return the contract of a policy that is trained on the dataset: its actions are the env's, without bounds."""
-    env = one.contract
-    specs = env.state or {}
-    return Contract(
+    env, specs = one.contract, one.contract.state or {}
+    contract = Contract(  # of a policy that is trained on the dataset: its actions are the env's, without bounds
         cameras={camera: (env.cameras or {}).get(camera, CameraSpec()) for camera in one.videos},
         state={part: replace(specs.get(part, StateSpec()), dim=values.shape[1]) for part, values in one.state.items()},
         gripper=one.gripper is not None,
         action=replace(env.action, dim=one.actions.shape[1], low=None, high=None),
         control_hz=env.control_hz,
     )
+    about = DatasetContract(contract, one.parts, names, angles, one.environment)
+    rows, features = _numbers(one, about)
+    images: dict[str, Stats] = {}
+    videos: dict[str, Path] = {}
+    for camera, video in one.videos.items():
+        key, seen = keys[camera], ImageStatistics()
+        with require("av").open(str(video)) as container:
+            stream = container.streams.video[0]
+            for frame in islice(container.decode(stream), len(one.actions)):
+                seen.add(frame.to_ndarray(format="rgb24"))
+            images[key], features[key] = seen.result(), video_feature(stream.height, stream.width, _fps(one.cell))
+        videos[key] = folder / f"{key}.mp4"
+        link_or_copy(video, videos[key])
+    return Finished(one.episode.result.instruction, features, rows, images, videos, about)
 
 
 def _numbers(one: _Demonstration, about: DatasetContract) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
@@ -308,15 +307,3 @@ def _numbers(one: _Demonstration, about: DatasetContract) -> tuple[dict[str, np.
         features[key]["unit"] = getattr((one.contract.state or {}).get(part), "unit", None)
         place += width
     return rows, features
-
-
-def _statistics(video: Path, frames: int) -> tuple[Stats, tuple[int, int]]:
-    """Return the statistics of the first `frames` images, and their (height, width) in pixels."""
-    seen = ImageStatistics()
-    with require("av").open(str(video)) as container:
-        stream = container.streams.video[0]
-        for number, frame in enumerate(container.decode(stream)):
-            if number == frames:
-                break
-            seen.add(frame.to_ndarray(format="rgb24"))
-        return seen.result(), (stream.height, stream.width)

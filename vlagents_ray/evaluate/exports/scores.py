@@ -55,8 +55,17 @@ class Score:
     @property
     def deviations(self) -> list[str]:
         """The differences from the protocol or the plan, a phrase each."""
-        found = [text for cell in self.cells for text in _deviations(cell)]
-        return list(dict.fromkeys(found))
+        found: dict[str, None] = {}
+        for cell in self.cells:
+            found |= {str(one): None for one in _protocol(cell).get("deviations") or []}
+            stated = {
+                "real time: the environment does not wait for the policy": cell.settings.get("clock") is not None,
+                "the policy got JPEG images": cell.settings.get("codec") == "jpeg",
+                f"{cell.env}: stopped early, after {cell.stopped_at} of {cell.planned} episodes": cell.stopped_at,
+                f"{cell.env}: {cell.missing} of {cell.planned} planned episodes have no result": cell.missing,
+            }
+            found |= {text: None for text, holds in stated.items() if holds}
+        return list(found)
 
     @property
     def note(self) -> str:
@@ -119,19 +128,6 @@ def _protocol(cell: CellResults) -> dict[str, Any]:
     return dict(stated) if isinstance(stated, dict) else {}
 
 
-def _deviations(cell: CellResults) -> list[str]:
-    found = [str(one) for one in _protocol(cell).get("deviations") or []]
-    if cell.settings.get("clock") is not None:
-        found.append("real time: the environment does not wait for the policy")
-    if cell.settings.get("codec") == "jpeg":
-        found.append("the policy got JPEG images")
-    if cell.stopped_at is not None:
-        found.append(f"{cell.env}: stopped early, after {cell.stopped_at} of {cell.planned} episodes")
-    if cell.missing:
-        found.append(f"{cell.env}: {cell.missing} of {cell.planned} planned episodes have no result")
-    return found
-
-
 def _distinct(values: Iterable[Any]) -> list[str]:
     return list(dict.fromkeys(str(value) for value in values if value))
 
@@ -192,21 +188,19 @@ def to_hub(results: Results, path: Path, **settings: Any) -> int:
     names = [one.name for one in found]
     short = [plain(name.rpartition("/")[2]) for name in names]
     ids = dict(zip(names, short, strict=True)) if len(set(short)) == len(short) else distinct(names)
-    entries = [_entry(one, given.task_id or ids[one.name], given) for one in found]
+    entries: list[dict[str, Any]] = [
+        {
+            "dataset": {"id": given.dataset, "task_id": given.task_id or ids[one.name]},
+            "value": round(100 * (one.rate.rate or 0.0), 2),
+            "date": one.date.isoformat().replace("+00:00", "Z"),
+            "notes": one.note,
+        }
+        for one in found
+    ]
+    if given.source_url is not None:
+        entries = [one | {"source": {"url": given.source_url, "name": "results by vlagents-ray"}} for one in entries]
     with whole_folder(path) as folder:
         file = folder / ".eval_results" / f"{plain(given.dataset)}.yaml"
         file.parent.mkdir()
         file.write_text(yaml.safe_dump(entries, sort_keys=False, allow_unicode=True, width=100), encoding="utf-8")
     return sum(one.rate.episodes for one in found)
-
-
-def _entry(score: Score, task: str, given: HubSettings) -> dict[str, Any]:
-    entry: dict[str, Any] = {
-        "dataset": {"id": given.dataset, "task_id": task},
-        "value": round(100 * (score.rate.rate or 0.0), 2),
-        "date": score.date.isoformat().replace("+00:00", "Z"),
-        "notes": score.note,
-    }
-    if given.source_url is not None:
-        entry["source"] = {"url": given.source_url, "name": "results by vlagents-ray"}
-    return entry

@@ -306,7 +306,12 @@ class Store:
                 f"{self._out} has results of other settings:\n{odd}\n"
                 f"take the old settings, or choose another out folder"
             )
-        lacking, programs = self._other_plan(db), self._other_programs(db)
+        lacking, programs = self._other_plan(db), dict[Change, None]()
+        for cell in self.cells:
+            query = "SELECT program FROM cells WHERE env = ? AND program IS NOT NULL AND cell = ?"
+            row = db.execute(query, (cell.env, cell.fingerprint)).fetchone()
+            if row is not None:
+                programs |= dict.fromkeys(program_changes(f"env {cell.env}", json.loads(row[0]), cell.program))
         self._accept_or_raise(
             "plan",
             lacking,
@@ -314,7 +319,7 @@ class Store:
             "plan these, too; give a new folder (--out); or add to the results and have the report say so "
             "(--accept-changes)",
         )
-        self._accept_or_raise("program", programs, "the environment is not that of the results in")
+        self._accept_or_raise("program", list(programs), "the environment is not that of the results in")
 
     def _other_plan(self, db: sqlite3.Connection) -> list[Change]:
         """Return the cells of the results that this plan lacks; a plan may grow, also by steps of a policy.
@@ -328,16 +333,6 @@ class Store:
         rows = db.execute("SELECT DISTINCT policy, suite, env FROM cells WHERE cell IN (SELECT cell FROM episodes)")
         gone = [" ".join(filter(None, row)) for row in rows if row not in mine and (row[0] in policies or not trained)]
         return [Change("plan", name, "in it", None) for name in gone]
-
-    def _other_programs(self, db: sqlite3.Connection) -> list[Change]:
-        """Return the files of environments that differ from those of the results."""
-        found: dict[Change, None] = {}  # in the order of the plan
-        for cell in self.cells:
-            query = "SELECT program FROM cells WHERE env = ? AND program IS NOT NULL AND cell = ?"
-            row = db.execute(query, (cell.env, cell.fingerprint)).fetchone()
-            if row is not None:
-                found |= dict.fromkeys(program_changes(f"env {cell.env}", json.loads(row[0]), cell.program))
-        return list(found)
 
     def _note_cells(self, db: sqlite3.Connection, config: EvalConfig) -> None:
         stop = config.stop.model_dump_json() if config.stop else None

@@ -209,7 +209,12 @@ def play(
             raise
         except PolicyFailed as error:
             failed = error
-        _require_alive(report)
+        for bark in report.barks:  # failures of infrastructure are not the policy's
+            if bark.startswith("server"):
+                raise PolicyUnavailable(f"the policy's server was silent: {bark}")
+            raise EnvFailed(f"robot: the control loop was held up: {bark}")
+        if 2 * report.safe.get("lost", 0) > report.jitter.get("ticks", 0):
+            raise PolicyUnavailable(f"the policy's server could not be reached: {report.reasons['lost']}")
         stats.ending = "policy_done" if report.done else "terminated" if stopped else "truncated"
         stats.ticks_held = report.safe_ticks
         result = stats.result(transport_of(agent), failed)
@@ -266,13 +271,3 @@ def _deadline_s(settings: RobotConfig) -> float:
     if settings.deadline_s is not None:
         return settings.deadline_s
     return 0.0 if settings.mode == "async" else _WAIT_S
-
-
-def _require_alive(report: LoopReport) -> None:
-    """Raise if the connection or the robot ended a trial: infrastructure failures are not the policy's."""
-    for bark in report.barks:
-        if bark.startswith("server"):
-            raise PolicyUnavailable(f"the policy's server was silent: {bark}")
-        raise EnvFailed(f"robot: the control loop was held up: {bark}")
-    if 2 * report.safe.get("lost", 0) > report.jitter.get("ticks", 0):
-        raise PolicyUnavailable(f"the policy's server could not be reached: {report.reasons['lost']}")
