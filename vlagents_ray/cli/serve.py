@@ -9,7 +9,6 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
-from urllib.parse import urlsplit
 
 import typer
 
@@ -139,14 +138,8 @@ def connection_lines(
         if not (insecure or args.access.insecure):  # --insecure shows no live page
             yield f"  what it does now: {url}/live"
         for name, one in describe(args.dialects).items():
-            places = [one["address"]] if "address" in one else [_address(url, path) for path in one["paths"]]
+            places = [one["address"]] if "address" in one else []
+            for path in () if places else one["paths"]:  # such as "WS /openpi"
+                method, _, place = path.partition(" ")
+                places.append(f"ws{url.removeprefix('http')}{place}" if method == "WS" else f"{method} {url}{place}")
             yield f"  {name}: {', '.join(places)}"
-
-
-def _address(url: str, path: str) -> str:
-    """Turn "WS /openpi" into a URL."""
-    method, _, place = path.partition(" ")
-    if method != "WS":
-        return f"{method} {url}{place}"
-    parts = urlsplit(url)
-    return f"{'wss' if parts.scheme == 'https' else 'ws'}://{parts.netloc}{parts.path}{place}"

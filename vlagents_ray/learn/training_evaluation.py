@@ -95,19 +95,16 @@ class TrainingEvaluation:
         """
         begun = monotonic()
         try:
-            if isinstance(self._policy, Agent):
-                return self._play_here(self._policy, version)
-            return self._play_served(self._policy, version)
+            if isinstance(agent := self._policy, str):
+                return self._play_served(agent, version)
+            pushed = PushedWeights(version=version, fingerprint=fingerprint(agent.parameters()))
+            session = _EvaluatedSession(agent, AgentCopies(agent), pushed)
+            with evaluation_mode(None if agent.trainable is None else attrgetter(agent.trainable)(agent)):
+                plan = self._of(pushed)
+                return evaluate(plan, agent_factory=lambda: session, in_process=True, progress=self._progress)
         finally:
             self._last_s = monotonic() - begun
             self._spent_s += self._last_s
-
-    def _play_here(self, agent: Agent, version: int) -> Summary:
-        pushed = PushedWeights(version=version, fingerprint=fingerprint(agent.parameters()))
-        session = _EvaluatedSession(agent, AgentCopies(agent), pushed)
-        trained = None if agent.trainable is None else attrgetter(agent.trainable)(agent)
-        with evaluation_mode(trained):
-            return evaluate(self._of(pushed), agent_factory=lambda: session, in_process=True, progress=self._progress)
 
     def _play_served(self, url: str, version: int) -> Summary:
         policy = self._plan.policies[0]

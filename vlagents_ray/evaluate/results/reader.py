@@ -161,7 +161,11 @@ class Results:
             attempts: dict[str, list[Attempt]] = {}
             for row in table(db, "attempts"):
                 attempts.setdefault(row["cell"], []).append(Attempt(**row | {"retried": bool(row["retried"])}))
-            runs = [_run(row) for row in table(db, "runs")]
+            runs = []
+            for row in table(db, "runs"):
+                parsed = {name: json.loads(row[name]) for name in ("config", "versions")}
+                changes = tuple(Change(**one) for one in json.loads(row["changes"] or "[]"))
+                runs.append(Run(**row | parsed | {"changes": changes}))
             written = written or is_locked(out)  # it may have begun by now
             return cls(
                 out,
@@ -274,11 +278,6 @@ def _cell(row: dict[str, Any], episodes: tuple[Episode, ...], attempts: tuple[At
         stopped_at = stopping.at
         episodes = tuple(replace(one, beyond=one.beyond or not stopping.counts(one.result.key)) for one in episodes)
     return CellResults(**row | parsed, episodes=episodes, attempts=attempts, stop=stop, stopped_at=stopped_at)
-
-
-def _run(row: dict[str, Any]) -> Run:
-    changes = tuple(Change(**one) for one in json.loads(row["changes"] or "[]"))
-    return Run(**row | {name: json.loads(row[name]) for name in ("config", "versions")} | {"changes": changes})
 
 
 def rate_of(cells: Sequence[CellResults], what: Literal["success_once", "success_at_end"]) -> Rate:

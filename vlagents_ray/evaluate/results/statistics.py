@@ -305,18 +305,16 @@ class Stopping:
         while self.at is None and self._begun in self._outcomes:
             self._successes += self._outcomes[self._begun]
             self._begun += 1
-            if self._begun >= self._stop.at_least and self._certain():
+            low, high = confidence_sequence(self._successes, self._begun, self._stop.error_rate)
+            target, width = self._stop.target, self._stop.width
+            certain = (target is not None and not low <= target <= high) or (width is not None and high - low < width)
+            if self._begun >= self._stop.at_least and certain:
                 self.at = self._begun
 
     def counts(self, key: EpisodeKey) -> bool:
         """Return whether the episode counts, as it comes before the end of the cell."""
         place = place_in_plan(key, self._seeds, self._each)
         return self.at is None or (place is not None and place < self.at)
-
-    def _certain(self) -> bool:
-        low, high = confidence_sequence(self._successes, self._begun, self._stop.error_rate)
-        target, width = self._stop.target, self._stop.width
-        return (target is not None and not low <= target <= high) or (width is not None and high - low < width)
 
 
 def place_in_plan(key: EpisodeKey, seeds: Sequence[int], each: int) -> int | None:
