@@ -19,7 +19,7 @@ import tempfile
 import zipfile
 import zlib
 from collections.abc import Iterator, Mapping
-from contextlib import closing, contextmanager
+from contextlib import closing
 from dataclasses import dataclass, field
 from glob import escape
 from itertools import islice, zip_longest
@@ -136,33 +136,27 @@ def unpack(archive: Path, folder: Path, *, most_bytes: int = MOST_BYTES) -> tupl
     Raises:
         ConfigError: The file is no bundle, or is larger than allowed, or has a name that leads out of `folder`.
     """
-    with _opened(archive) as file:
-        members = _checked(archive, file, most_bytes)
-        manifest, sha256 = _manifest(archive, file, members.pop(MANIFEST, None))
-        found: dict[str, FileDigest] = {}
-        for name, member in members.items():
-            target = folder / name
-            target.parent.mkdir(parents=True, exist_ok=True)
-            with file.open(member) as source, target.open("xb") as written:
-                found[name] = _copy(archive, source, written, member)
+    if not archive.is_file():
+        raise ConfigError(f"{archive}: got no file, want a bundle that `vlagents-ray bundle` wrote")
+    try:
+        with zipfile.ZipFile(archive) as file:
+            members = _checked(archive, file, most_bytes)
+            manifest, sha256 = _manifest(archive, file, members.pop(MANIFEST, None))
+            found: dict[str, FileDigest] = {}
+            for name, member in members.items():
+                target = folder / name
+                target.parent.mkdir(parents=True, exist_ok=True)
+                with file.open(member) as source, target.open("xb") as written:
+                    found[name] = _copy(archive, source, written, member)
+    except ConfigError:
+        raise
+    except _BROKEN as error:
+        raise ConfigError(f"{archive}: cannot be read as a bundle ({error}); copy it again from its source") from error
     stated = manifest.files
     odd = [f"{name} is not in the bundle" for name in stated.keys() - found.keys()]
     odd += [f"{name} is not in the manifest" for name in found.keys() - stated.keys()]
     odd += [f"{name} has another digest" for name in stated.keys() & found.keys() if stated[name] != found[name]]
     return manifest, sha256, sorted(odd)
-
-
-@contextmanager
-def _opened(archive: Path) -> Iterator[zipfile.ZipFile]:
-    if not archive.is_file():
-        raise ConfigError(f"{archive}: got no file, want a bundle that `vlagents-ray bundle` wrote")
-    try:
-        with zipfile.ZipFile(archive) as file:
-            yield file
-    except ConfigError:
-        raise
-    except _BROKEN as error:
-        raise ConfigError(f"{archive}: cannot be read as a bundle ({error}); copy it again from its source") from error
 
 
 def _checked(archive: Path, file: zipfile.ZipFile, most_bytes: int) -> dict[str, zipfile.ZipInfo]:

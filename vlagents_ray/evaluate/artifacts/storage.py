@@ -141,20 +141,14 @@ def storing(folder: Path) -> Iterator[None]:
     try:
         yield
     except (OSError, sqlite3.OperationalError) as error:
-        found = error.errno if isinstance(error, OSError) else _number(error, folder)
+        found = error.errno if isinstance(error, OSError) else _SQLITE.get(str(error))
+        if isinstance(error, sqlite3.OperationalError) and found == errno.EACCES:
+            disk = os.statvfs(next(one for one in (folder, *folder.absolute().parents) if one.exists()))
+            found = errno.EROFS if disk.f_flag & os.ST_RDONLY else found
         if found not in _CURES:
             raise
         what, cure = _CURES[found]
         raise StorageFailed(f"{folder}: {what} ({error}); {cure}") from error
-
-
-def _number(error: sqlite3.OperationalError, folder: Path) -> int | None:
-    """Return the errno of an error of SQLite; None if it is not about the disk."""
-    number = _SQLITE.get(str(error))
-    disk = os.statvfs(next(one for one in (folder, *folder.absolute().parents) if one.exists()))
-    if number == errno.EACCES and disk.f_flag & os.ST_RDONLY:
-        return errno.EROFS
-    return number
 
 
 def driver_code() -> dict[str, GitState | None]:

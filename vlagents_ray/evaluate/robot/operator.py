@@ -212,8 +212,13 @@ class TerminalOperator(Operator):
                 outcome = _OUTCOMES.get(self._ask(f"verdict ({choices}): ").strip().lower())
                 if outcome is None:
                     continue
-                earned = self._earned(trial) if outcome == "partial" and trial.rubric else ()
-                verdict = Verdict(outcome, earned, self._ask("why: " if outcome == "repeat" else "note: ").strip())
+                earned = []
+                for part, points in trial.rubric.items() if outcome == "partial" else ():
+                    if self._ask(f"  {part} ({points:g} points), reached? y/n: ").strip().lower().startswith("y"):
+                        earned.append(part)
+                verdict = Verdict(
+                    outcome, tuple(earned), self._ask("why: " if outcome == "repeat" else "note: ").strip()
+                )
             except EOFError:
                 raise KeyboardInterrupt from None
             try:
@@ -222,13 +227,6 @@ class TerminalOperator(Operator):
                 self._say(str(error))
             else:
                 return verdict
-
-    def _earned(self, trial: VisibleTrial) -> tuple[str, ...]:
-        return tuple(
-            part
-            for part, points in trial.rubric.items()
-            if self._ask(f"  {part} ({points:g} points), reached? y/n: ").strip().lower().startswith("y")
-        )
 
     def _look(self, trial: VisibleTrial, obs: Obs) -> None:
         if not trial.start:
