@@ -211,7 +211,9 @@ class Tuner:
                 frames = Path(folder) / "frames.npz"
                 save_observations(recorded_observations(self._plan.frames, FRAMES), frames)
             ready = self._measure_own(frames)
-            variants = self._variants(ready, self._useful())
+            rates = {size.sessions: statistics.median(size.rates) for size in self._sizes}
+            most = max(rates, key=rates.__getitem__) if self._plan.goal.kind == "throughput" else max(rates)
+            variants = self._variants(ready, sorted(size for size in rates if size <= most))
             for number, variant in enumerate(variants):
                 self._try(variant, frames, parts=len(variants) - number)
         return [size.point() for size in self._sizes]
@@ -254,12 +256,6 @@ class Tuner:
         compiled = [{"compile": mode} | ({"batch_sizes": list(sizes)} if mode and free else {}) for mode in modes]
         both = [one | other for other in compiled for one in dtypes]
         return [Variant(changes) for changes in [*dtypes, *compiled, *both]]
-
-    def _useful(self) -> list[int]:
-        """Return the measured sizes; for throughput, up to the one with the largest rate."""
-        rates = {size.sessions: statistics.median(size.rates) for size in self._sizes}
-        most = max(rates, key=rates.__getitem__) if self._plan.goal.kind == "throughput" else max(rates)
-        return sorted(size for size in rates if size <= most)
 
     def _try(self, variant: Variant, frames: Path | None, parts: int) -> None:
         """Measure a variant, or report its failure."""
@@ -416,23 +412,18 @@ def recorded_observations(folder: Path, count: int) -> list[Obs]:
     used = files[:: max(1, len(files) // count)][:count]
     found: list[Obs] = []
     for number, file in enumerate(used):
-        share = len(range(number, count, len(used)))
-        found += _of_trajectory(file, share)
+        share, trajectory = len(range(number, count, len(used))), Trajectory.load(file)
+        steps = np.linspace(0, len(trajectory.actions), share, dtype=int).tolist()
+        images = {camera: _images(video, steps) for camera, video in videos_of(file, trajectory.cameras).items()}
+        found += [
+            Obs(
+                cameras={camera: images[camera][step] for camera in trajectory.cameras},
+                gripper=None if trajectory.gripper is None else float(trajectory.gripper[step]),
+                state={part: values[step] for part, values in trajectory.state.items()},
+            )
+            for step in steps
+        ]
     return found
-
-
-def _of_trajectory(file: Path, count: int) -> list[Obs]:
-    trajectory = Trajectory.load(file)
-    steps = np.linspace(0, len(trajectory.actions), count, dtype=int).tolist()
-    images = {camera: _images(video, steps) for camera, video in videos_of(file, trajectory.cameras).items()}
-    return [
-        Obs(
-            cameras={camera: images[camera][step] for camera in trajectory.cameras},
-            gripper=None if trajectory.gripper is None else float(trajectory.gripper[step]),
-            state={part: values[step] for part, values in trajectory.state.items()},
-        )
-        for step in steps
-    ]
 
 
 def _images(video: Path, steps: list[int]) -> dict[int, np.ndarray]:

@@ -96,8 +96,19 @@ def merge(out: Path, folders: Sequence[Path], *, keep_first: bool = False, accep
         )
     with storing(out):
         _link_files(merged, out, folders)
-        with whole(out / FILE) as part:
-            _write(merged, part)
+        tables = {
+            "runs": merged.runs,
+            "policies": list(merged.policies.values()),
+            "cells": list(merged.cells.values()),
+            "episodes": list(merged.episodes.values()),
+            "attempts": merged.attempts,
+            "workers": merged.workers,
+        }
+        with whole(out / FILE) as part, closing(sqlite3.connect(part)) as db:
+            db.executescript(f"BEGIN; {SCHEMA} PRAGMA user_version = {VERSION}; COMMIT;")
+            with db:
+                for name, row in ((name, row) for name, rows in tables.items() for row in rows):
+                    insert(db, name, row)
         summary = summarize(Results.load(out))
         write_summary(summary)
     write_report(summary.results, out / REPORT)
@@ -223,23 +234,6 @@ def _link_files(merged: _Merged, out: Path, folders: Sequence[Path]) -> None:
         link_or_copy(source, target)
 
 
-def _write(merged: _Merged, path: Path) -> None:
-    tables = {
-        "runs": merged.runs,
-        "policies": list(merged.policies.values()),
-        "cells": list(merged.cells.values()),
-        "episodes": list(merged.episodes.values()),
-        "attempts": merged.attempts,
-        "workers": merged.workers,
-    }
-    with closing(sqlite3.connect(path)) as db:
-        db.executescript(f"BEGIN; {SCHEMA} PRAGMA user_version = {VERSION}; COMMIT;")
-        with db:
-            for name, rows in tables.items():
-                for row in rows:
-                    insert(db, name, row)
-
-
 def combined(folders: Sequence[Results]) -> Results:
     """Combine the results of several folders.
 
@@ -253,14 +247,22 @@ def combined(folders: Sequence[Results]) -> Results:
         raise ConfigError("report: got no folder, want one or more that evaluations wrote their results to")
     if len(folders) == 1:
         return folders[0]
-    _require_apart(folders)
+    seen: dict[str, Path] = {}
+    for each in folders:
+        for cell in each.cells:
+            if (first := seen.setdefault(cell.cell, each.out)) is not each.out:
+                raise ConfigError(
+                    f"report: {first} and {each.out} both have {cell.contender!r} in {cell.env!r} with the same "
+                    f"settings; put parts of one evaluation into one folder first: `vlagents-ray merge OUT {first} "
+                    f"{each.out}`, with --accept-changes if code or weights changed between them"
+                )
     every = [cell for each in folders for cell in each.cells]
     counts = Counter((cell.contender, cell.suite, cell.env) for cell in every)
     clashing = {cell.policy for cell in every if counts[cell.contender, cell.suite, cell.env] > 1}
-    first: dict[tuple[str, str | None], str] = {}  # the weights by policy id and checkpoint
+    known: dict[tuple[str, str | None], str] = {}  # the weights by policy id and checkpoint
     for cell in every:
         weights, checkpoint = stated(cell, "weights"), stated(cell, "checkpoint")
-        if weights is not None and first.setdefault((cell.contender, checkpoint), weights) != weights:
+        if weights is not None and known.setdefault((cell.contender, checkpoint), weights) != weights:
             clashing.add(cell.policy)
     base = Path(os.path.commonpath([each.out.resolve() for each in folders]))
     cells: list[CellResults] = []
@@ -290,15 +292,3 @@ def combined(folders: Sequence[Results]) -> Results:
         runs += [replace(run, run=run.run + len(runs)) for run in each.runs]
     parts = tuple(sorted((each.out.resolve() for each in folders), reverse=True))  # subfolders before their parents
     return Results(base, tuple(cells), tuple(runs), policies, tuple(workers), parts)
-
-
-def _require_apart(folders: Sequence[Results]) -> None:
-    seen: dict[str, Path] = {}
-    for each in folders:
-        for cell in each.cells:
-            if (first := seen.setdefault(cell.cell, each.out)) is not each.out:
-                raise ConfigError(
-                    f"report: {first} and {each.out} both have {cell.contender!r} in {cell.env!r} with the same "
-                    f"settings; put parts of one evaluation into one folder first: `vlagents-ray merge OUT {first} "
-                    f"{each.out}`, with --accept-changes if code or weights changed between them"
-                )

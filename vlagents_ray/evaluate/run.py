@@ -269,24 +269,19 @@ class _Run:
         self.store.record(result, job.attempt, videos, trajectory)
         self.progress.episode(job.cell, result)
         self._left[job.key.settings] -= 1
-        self._stop_if_certain(job, result)
+        stopping = self._stopping.get(job.cell.fingerprint)
+        if stopping is not None and stopping.at is None:
+            stopping.add(result)
+            if stopping.at is not None:  # its outcomes suffice; running episodes are finished
+                dropped = self._queue.drop(job.cell.fingerprint)
+                self._left[job.key.settings] -= dropped
+                self.progress.stopped(job.cell, stopping.at, dropped)
         if not self._left[job.key.settings]:
             self.tracking.update()
 
     def _has_stopped(self, job: Job) -> bool:
         stopping = self._stopping.get(job.cell.fingerprint)
         return stopping is not None and stopping.at is not None
-
-    def _stop_if_certain(self, job: Job, result: EpisodeResult) -> None:
-        """Drop the waiting episodes of the cell once its outcomes suffice; running episodes are finished."""
-        stopping = self._stopping.get(job.cell.fingerprint)
-        if stopping is None or self._has_stopped(job):
-            return
-        stopping.add(result)
-        if stopping.at is not None:
-            dropped = self._queue.drop(job.cell.fingerprint)
-            self._left[job.key.settings] -= dropped
-            self.progress.stopped(job.cell, stopping.at, dropped)
 
 
 class Deadline:

@@ -208,11 +208,14 @@ class TrackerFeed:
                 if not over or logged.get(part) == group.episodes:
                     continue
                 run = self._run(name, results, cells[0].policy)
-                run.log(_metrics(group), cells[0].step)
+                rates = {"success_once": group.success_once.rate, "success_at_end": group.success_at_end.rate}
+                values = rates | {"return": group.mean_return, "steps": group.mean_steps, "episodes": group.episodes}
+                label = "/".join(filter(None, (group.suite, group.env)))
+                run.log({f"{label}/{k}": float(v) for k, v in values.items() if v is not None}, cells[0].step)
                 ordered = sorted(cells[0].episodes, key=lambda one: bool(one.result.success_once))
                 paths = [self._config.out / path for one in ordered for path in one.videos[:1]]
                 if part == cells[0].cell and (videos := paths[: self._config.tracking.videos]):
-                    run.videos(_label(group), videos, cells[0].step)
+                    run.videos(label, videos, cells[0].step)
                 with db:
                     db.execute("INSERT OR REPLACE INTO tracked VALUES (?, ?, ?)", (name, part, group.episodes))
 
@@ -242,18 +245,3 @@ def _parts(results: Results) -> list[tuple[str, list[CellResults], Group]]:
     alone = [(cell.cell, [cell], group) for cell, group in zip(results.cells, summary.cells, strict=True)]
     totals = zip(results.contenders, summary.totals, strict=True)
     return alone + [(contender, results.of(contender), group) for contender, group in totals]
-
-
-def _label(group: Group) -> str:
-    return "/".join(filter(None, (group.suite, group.env)))
-
-
-def _metrics(group: Group) -> dict[str, float]:
-    values = {
-        "success_once": group.success_once.rate,
-        "success_at_end": group.success_at_end.rate,
-        "return": group.mean_return,
-        "steps": group.mean_steps,
-        "episodes": group.episodes,
-    }
-    return {f"{_label(group)}/{name}": float(value) for name, value in values.items() if value is not None}

@@ -119,8 +119,23 @@ class Store:
         by other weights of the same name, or by other weights than the pushed ones of its cell: a rate has one
         checkpoint.
         """
-        self._require_pushed_weights(result)
-        self._require_same_checkpoint(result)
+        cell = self._cell[result.key.settings]
+        want = cell.policy.pushed_weights
+        acted = (result.first_policy_version, result.policy_version, result.policy_fingerprint)
+        if want and result.policy_version is not None and acted != (want.version, want.version, want.fingerprint):
+            raise WeightsLost(
+                f"policy: {result.key} was played by versions {acted[0]} to {acted[1]} of the weights ({acted[2]}), "
+                f"want {want.version} ({want.fingerprint}); push nothing while a version is evaluated, and let the "
+                f"policy's `options` ask for no other"
+            )
+        known = self._db.execute(
+            "SELECT checkpoint FROM episodes WHERE cell = ? AND checkpoint IS NOT NULL LIMIT 1", (result.key.settings,)
+        ).fetchone()
+        if known is not None and result.checkpoint not in (None, known[0]):
+            raise ConfigError(
+                f"policy: {result.key} was played by checkpoint {result.checkpoint!r}, the results in {self._out} "
+                f"are of {known[0]!r}; serve that one again, or choose another out folder"
+            )
         self._require_same_weights(result)
         row = asdict(result)
         key = row.pop("key")
@@ -132,8 +147,8 @@ class Store:
             "timing_ms": canonical(result.timing_ms),
             "videos": canonical(list(videos)),
             "trajectory": trajectory,
-            "env_program": program_id(self._cell[result.key.settings].program),
-            "policy_program": self._policy_programs.get(self._cell[result.key.settings].policy.name),
+            "env_program": program_id(cell.program),
+            "policy_program": self._policy_programs.get(cell.policy.name),
             "attempts": attempts,
             "run": self._run,
             "finished": time.time() if finished is None else finished,
@@ -141,28 +156,6 @@ class Store:
         with self._db:
             self._db.execute("DELETE FROM episodes WHERE key = ? AND status = 'infra_failed'", (row["key"],))
             insert(self._db, "episodes", row)
-
-    def _require_pushed_weights(self, result: EpisodeResult) -> None:
-        want = self._cell[result.key.settings].policy.pushed_weights
-        if want is None or result.policy_version is None:
-            return
-        acted = (result.first_policy_version, result.policy_version, result.policy_fingerprint)
-        if acted != (want.version, want.version, want.fingerprint):
-            raise WeightsLost(
-                f"policy: {result.key} was played by versions {acted[0]} to {acted[1]} of the weights ({acted[2]}), "
-                f"want {want.version} ({want.fingerprint}); push nothing while a version is evaluated, and let the "
-                f"policy's `options` ask for no other"
-            )
-
-    def _require_same_checkpoint(self, result: EpisodeResult) -> None:
-        known = self._db.execute(
-            "SELECT checkpoint FROM episodes WHERE cell = ? AND checkpoint IS NOT NULL LIMIT 1", (result.key.settings,)
-        ).fetchone()
-        if known is not None and result.checkpoint not in (None, known[0]):
-            raise ConfigError(
-                f"policy: {result.key} was played by checkpoint {result.checkpoint!r}, the results in {self._out} "
-                f"are of {known[0]!r}; serve that one again, or choose another out folder"
-            )
 
     def _require_same_weights(self, result: EpisodeResult) -> None:
         if result.weights is None:
