@@ -110,17 +110,15 @@ class _Terminal:
         """Print a line of another process, or keep it."""
         level = logging.INFO if _SERVES_INFO.match(line) else logging.WARNING
         text = f"({actor} pid={process}) {line}"
-        if self._is_load_failure(process, line) or not _is_problem(line, level):
-            self._note(text)
-        else:
-            sys.stderr.write(f"{text}\n")
-
-    def _is_load_failure(self, process: str, line: str) -> bool:
         if any(one in line for one in _LOAD_FAILURES):
             self.failing.add(process)
         elif _SERVES_LINE.match(line):
             self.failing.discard(process)
-        return self._started is not None and not self._started.is_set() and process in self.failing
+        starting = self._started is not None and not self._started.is_set()
+        if (starting and process in self.failing) or not _is_problem(line, level):
+            self._note(text)
+        else:
+            sys.stderr.write(f"{text}\n")
 
     def _note(self, text: str) -> None:
         if self._kept is not None:

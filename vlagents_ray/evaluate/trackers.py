@@ -17,8 +17,8 @@ from vlagents_ray.evaluate.artifacts.storage import PROVENANCE
 from vlagents_ray.evaluate.plan.config import EvalConfig, Tracker, fingerprint
 from vlagents_ray.evaluate.results.changes import IDENTITY
 from vlagents_ray.evaluate.results.database import FILE, WAIT_S
-from vlagents_ray.evaluate.results.reader import CellResults, Results
-from vlagents_ray.evaluate.results.summary import Group, summarize
+from vlagents_ray.evaluate.results.reader import Results
+from vlagents_ray.evaluate.results.summary import summarize
 from vlagents_ray.naming import plain
 from vlagents_ray.registry import require
 
@@ -200,7 +200,10 @@ class TrackerFeed:
     def _log_to(self, name: Tracker, results: Results) -> None:
         with closing(sqlite3.connect(self._config.out / FILE, timeout=WAIT_S)) as db:
             logged = dict(db.execute("SELECT what, episodes FROM tracked WHERE tracker = ?", (name,)))
-            for part, cells, group in _parts(results):
+            summary, policies = summarize(results), results.contenders
+            parts = [(one.cell, [one], group) for one, group in zip(results.cells, summary.cells, strict=True)]
+            parts += [(one, results.of(one), group) for one, group in zip(policies, summary.totals, strict=True)]
+            for part, cells, group in parts:  # each cell, then each policy id
                 over = all(
                     cell.stopped_at is not None or sum(not one.beyond for one in cell.episodes) >= cell.planned
                     for cell in cells
@@ -237,11 +240,3 @@ class TrackerFeed:
             {"evaluation": results.runs[-1].config, "served": served, "code": code},
             sorted((out / PROVENANCE).glob("*.diff")),
         )  # fmt: skip
-
-
-def _parts(results: Results) -> list[tuple[str, list[CellResults], Group]]:
-    """Return the groups that are logged together, as (key, cells, aggregates): each cell, then each policy id."""
-    summary = summarize(results)
-    alone = [(cell.cell, [cell], group) for cell, group in zip(results.cells, summary.cells, strict=True)]
-    totals = zip(results.contenders, summary.totals, strict=True)
-    return alone + [(contender, results.of(contender), group) for contender, group in totals]

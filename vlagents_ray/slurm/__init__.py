@@ -58,32 +58,29 @@ def submit_evaluation(
         HookFailed: The evaluation could not be submitted, and `raise_errors` is set.
     """
     try:
-        return _submit_once(list(words), os.fspath(checkpoint), step, Path(record), os.fspath(python))
+        checkpoint, folder, words = os.fspath(checkpoint), Path(record), list(words)
+        name = hashlib.sha256(json.dumps([os.path.abspath(checkpoint), step, words]).encode()).hexdigest()[:16]
+        folder.mkdir(parents=True, exist_ok=True)
+        mark = folder / f"step-{step}-{name}.json"
+        # Submit other checkpoints whose claiming processes were killed, since no other call may follow for them.
+        for other in sorted(folder.glob("step-*.json")):
+            abandoned = _read(other)
+            if other == mark or "words" not in abandoned or _abandoned_since(other) is None:
+                continue
+            try:
+                if _is_claimed(other, abandoned):
+                    job, of = _submit(other, abandoned, os.fspath(python)), abandoned["step"]
+                    log.info("step %s: submitted as job %s, in place of a training that was killed", of, job)
+            except Exception:
+                log.exception("the evaluation of step %s was not submitted; training continues", abandoned["step"])
+        filled = [word.replace("{checkpoint}", checkpoint).replace("{step}", str(step)) for word in words]
+        claim = {"step": step, "checkpoint": checkpoint, "words": filled}
+        return _submit(mark, claim, os.fspath(python)) if _is_claimed(mark, claim) else None
     except Exception as error:
         if raise_errors:
             raise HookFailed(f"step {step}: {error}") from error
         log.exception("the evaluation of step %d was not submitted; training continues", step)
         return None
-
-
-def _submit_once(words: list[str], checkpoint: str, step: int, record: Path, python: str) -> str | None:
-    filled = [word.replace("{checkpoint}", checkpoint).replace("{step}", str(step)) for word in words]
-    name = hashlib.sha256(json.dumps([os.path.abspath(checkpoint), step, words]).encode()).hexdigest()[:16]
-    record.mkdir(parents=True, exist_ok=True)
-    mark = record / f"step-{step}-{name}.json"
-    # Submit other checkpoints whose claiming processes were killed, since no other call may follow for them.
-    for other in sorted(record.glob("step-*.json")):
-        abandoned = _read(other)
-        if other == mark or "words" not in abandoned or _abandoned_since(other) is None:
-            continue
-        try:
-            if _is_claimed(other, abandoned):
-                job = _submit(other, abandoned, python)
-                log.info("step %s: submitted as job %s, in place of a training that was killed", abandoned["step"], job)
-        except Exception:
-            log.exception("the evaluation of step %s was not submitted; training continues", abandoned["step"])
-    claim = {"step": step, "checkpoint": checkpoint, "words": filled}
-    return _submit(mark, claim, python) if _is_claimed(mark, claim) else None
 
 
 def _is_claimed(mark: Path, claim: dict[str, Any]) -> bool:

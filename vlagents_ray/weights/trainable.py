@@ -44,12 +44,23 @@ def set_values(trainable: Any, named: Mapping[str, Any]) -> None:
     Values on a GPU are copied to the addresses of the old ones, which a CUDA graph may have recorded. All
     others are replaced by reference, which takes no time and no memory; `named` must not be changed afterwards.
     """
-    if _is_module(trainable):
-        _set_tensors(trainable, named)
+    if not _is_module(trainable):
+        for name, container, key in list(_leaves(trainable)):
+            if name in named:
+                container[key] = named[name]
         return
-    for name, container, key in list(_leaves(trainable)):
-        if name in named:
-            container[key] = named[name]
+    held = {
+        **dict(trainable.named_buffers(remove_duplicate=False)),
+        **dict(trainable.named_parameters(remove_duplicate=False)),
+    }
+    with sys.modules["torch"].no_grad():
+        for name, alias in trainable.state_dict().items():
+            if name not in named:
+                continue
+            if name in held and alias.device.type == "cpu":
+                held[name].data = named[name]
+            else:
+                copy(named[name], alias) if alias.is_contiguous() else alias.copy_(named[name])
 
 
 @contextmanager
@@ -164,22 +175,6 @@ def dtype_name(value: Any) -> str:
 def is_array(value: Any) -> bool:
     """Return whether a value is an array or a tensor."""
     return hasattr(value, "shape") and hasattr(value, "dtype")
-
-
-def _set_tensors(module: Any, named: Mapping[str, Any]) -> None:
-    torch = sys.modules["torch"]
-    held = {
-        **dict(module.named_buffers(remove_duplicate=False)),
-        **dict(module.named_parameters(remove_duplicate=False)),
-    }
-    with torch.no_grad():
-        for name, alias in module.state_dict().items():
-            if name not in named:
-                continue
-            if name in held and alias.device.type == "cpu":
-                held[name].data = named[name]
-            else:
-                copy(named[name], alias) if alias.is_contiguous() else alias.copy_(named[name])
 
 
 def _leaves(tree: Any, path: str = "") -> Iterator[tuple[str, Any, Any]]:

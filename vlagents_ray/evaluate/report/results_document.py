@@ -114,7 +114,12 @@ class ResultsDocument:
             "done": sum(_done(cell) for cell in cells),
             "planned": sum(_planned(cell) for cell in cells),
             "retries": sum(attempt.retried for cell in cells for attempt in cell.attempts),
-            "cells": [_cell(cell) for cell in cells],
+            "cells": [
+                {"policy": cell.contender, "task": cell.task, "done": _done(cell), "planned": _planned(cell)}
+                | {"stopped": cell.stopped_at is not None, "sequence": cell.stop is not None}
+                | _rate(rate_of([cell], "success_once"))
+                for cell in cells
+            ],
             "curves": [{"policy": policy, "points": points} for policy, points in curves.items()],
             "failed": len(failed),
             "failures": [self._failure(cell, one) for cell, one in failed[:_FAILURES]],
@@ -144,12 +149,6 @@ def _done(cell: CellResults) -> int:
 
 def _planned(cell: CellResults) -> int:
     return cell.planned if cell.stopped_at is None else _done(cell)
-
-
-def _cell(cell: CellResults) -> dict[str, Any]:
-    counts = {"policy": cell.contender, "task": cell.task, "done": _done(cell), "planned": _planned(cell)}
-    stopped = {"stopped": cell.stopped_at is not None, "sequence": cell.stop is not None}
-    return counts | stopped | _rate(rate_of([cell], "success_once"))
 
 
 def _rate(rate: Rate) -> dict[str, Any]:

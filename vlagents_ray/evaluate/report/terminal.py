@@ -18,7 +18,7 @@ from vlagents_ray.evaluate.episode.records import EpisodeResult
 from vlagents_ray.evaluate.plan.cases import EvalCase
 from vlagents_ray.evaluate.plan.jobs import Job
 from vlagents_ray.evaluate.report.page import FILE as REPORT
-from vlagents_ray.evaluate.results.comparison import Comparison, clock_gaps
+from vlagents_ray.evaluate.results.comparison import clock_gaps
 from vlagents_ray.evaluate.results.database import RUNNING
 from vlagents_ray.evaluate.results.statistics import Rate, confidence_sequence
 from vlagents_ray.evaluate.results.summary import Group, Summary, cause_of, errors_of_policies, pushed_of
@@ -277,7 +277,16 @@ def print_summary(console: Console, summary: Summary) -> None:
     parts = [part for name in summary.results.contenders for part in summary.parts(name).values()]
     if not all(part.success_once.pooled for part in parts):
         lines.append("cells that stopped after different numbers of episodes have no rate in common: quote each alone")
-    lines += [_gap(one) for one in clock_gaps(summary.results)]
+    for gap in clock_gaps(summary.results):  # as in the report, on the episodes of both clocks
+        counted = [one for cell in gap.cells for one in cell.counted]
+        steps = max(1, sum(one.steps for one in counted))  # 0 if the policy failed before the first step of each
+        waited, held = (sum(getattr(one, what) for one in counted) for what in ("ticks_waited", "ticks_held"))
+        low, high = gap.total.interval
+        lines.append(
+            f"{gap.a}: {100 * (gap.total.pairs.difference or 0):+.1f} points to the synchronous score "
+            f"({100 * low:+.1f} to {100 * high:+.1f}, {gap.total.pairs.total} pairs); "
+            f"{waited / steps:.0%} of its ticks waited for an answer, {held / steps:.0%} with nothing to execute"
+        )
     if summary.state != "complete":
         lines.append("still running" if summary.state == RUNNING else f"{summary.state}: go on with --resume")
     lines.append(f"results: {summary.out}")
@@ -285,19 +294,6 @@ def print_summary(console: Console, summary: Summary) -> None:
     lines += [f"{name}: {path}" for name, path in written.items() if path.exists()]
     for line in lines:
         console.print(line, markup=False, highlight=False, soft_wrap=True)
-
-
-def _gap(gap: Comparison) -> str:
-    """Return the gap to the synchronous score, as in the report: on the episodes of both clocks."""
-    played = [one for cell in gap.cells for one in cell.counted]
-    steps = max(1, sum(one.steps for one in played))  # 0 if the policy failed before the first step of each
-    waited, held = (sum(getattr(one, what) for one in played) for what in ("ticks_waited", "ticks_held"))
-    low, high = gap.total.interval
-    return (
-        f"{gap.a}: {100 * (gap.total.pairs.difference or 0):+.1f} points to the synchronous score "
-        f"({100 * low:+.1f} to {100 * high:+.1f}, {gap.total.pairs.total} pairs); "
-        f"{waited / steps:.0%} of its ticks waited for an answer, {held / steps:.0%} with nothing to execute"
-    )
 
 
 def _cells(group: Group, timing: str) -> list[str]:
