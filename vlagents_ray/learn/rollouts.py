@@ -24,10 +24,10 @@ from vlagents_ray.evaluate.plan.cases import cells, require_envs
 from vlagents_ray.evaluate.plan.config import EpisodeChoice, EvalConfig
 from vlagents_ray.evaluate.plan.jobs import EpisodeKey, Job, JobQueue
 from vlagents_ray.evaluate.workers.cluster import ray_cluster
-from vlagents_ray.evaluate.workers.pool import FailedAttempts, WorkerPool, dispatch
+from vlagents_ray.evaluate.workers.pool import FailedAttempts, WorkerPool, Workers, dispatch
 from vlagents_ray.evaluate.workers.rollout import Report, agents
 from vlagents_ray.interface import BEHAVIOUR, WANT, Act, Agent, Obs
-from vlagents_ray.learn.columns import EXTRA, FINAL, REPLAY, at_rows, constant, tensors, words
+from vlagents_ray.learn.columns import EXTRA, FINAL, REPLAY, at_rows, tensors
 from vlagents_ray.registry import require
 
 WANTED = ("logprob", "value", "entropy", REPLAY)  # columns that a policy fills
@@ -134,12 +134,14 @@ class TransitionRecorder(EpisodeRecorder):
             **{name: np.array(values, np.float32) for name, values in self._wanted.items()},
             "version": np.array(versions, np.int64),
         }
-        columns = {"key": constant(pa, str(result.key), rows), "instruction": constant(pa, result.instruction, rows)}
+        same = pa.array(np.zeros(rows, np.int32))  # the same text in each row
+        texts = {"key": str(result.key), "instruction": result.instruction}
+        columns = {name: pa.DictionaryArray.from_arrays(same, pa.array([text])) for name, text in texts.items()}
         columns |= {name: tensors(pa, values) for name, values in numbers.items()}
         columns |= {FINAL + name: at_rows(pa, values[-1:], last) for name, values in seen.items()}
         begun = np.diff(acts, prepend=-1) != 0  # first rows of each act
         columns |= {f"{REPLAY}.{name}": at_rows(pa, values.all(), begun) for name, values in self._replay.items()}
-        columns["source"] = words(pa, list(sources))
+        columns["source"] = pa.array(list(sources), pa.string()).dictionary_encode()
         return pa.RecordBatch.from_pydict(columns)
 
 
@@ -287,7 +289,7 @@ class Rollouts:
         self._episodes: dict[EpisodeKey, _PlannedEpisode] = {}  # from number `position` on
         self._attempts = FailedAttempts(config)
         self._resources = ExitStack()
-        self._pool: WorkerPool | None = None
+        self._pool: Workers | None = None
         self._version = self._pushed = 0
         self.stats = RolloutStats()  # the numbers of episodes so far
 

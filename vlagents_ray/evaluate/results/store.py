@@ -11,6 +11,7 @@ import os
 import sqlite3
 import time
 from collections.abc import Hashable, Sequence
+from contextlib import AbstractContextManager
 from dataclasses import asdict
 from typing import Any
 
@@ -43,8 +44,8 @@ from vlagents_ray.evaluate.results.database import (
 )
 
 
-class Store:
-    """The results of one `out` folder, open for one evaluation at a time. Use as a context manager."""
+class Store(AbstractContextManager["Store"]):
+    """The results of one `out` folder, open for one evaluation at a time."""
 
     def __init__(self, config: EvalConfig) -> None:
         """Open or begin the results in `config.out`.
@@ -73,9 +74,6 @@ class Store:
         except BaseException:
             os.close(self._lock)
             raise
-
-    def __enter__(self) -> Store:
-        return self
 
     def __exit__(self, *exc: object) -> None:
         self.close()

@@ -64,8 +64,8 @@ class LoggedTrial:
         return "again" not in self.seen
 
 
-class TrialLog:
-    """The log in one folder, open for one evaluation at a time. Use as a context manager."""
+class TrialLog(contextlib.AbstractContextManager["TrialLog"]):
+    """The log in one folder, open for one evaluation at a time."""
 
     def __init__(self, config: EvalConfig, cells: Sequence[EvalCase]) -> None:
         """Open or begin the log in `config.out`.
@@ -97,9 +97,6 @@ class TrialLog:
                     f"{self._path}: another evaluation is writing there; wait for it, or choose another folder"
                 ) from error
             raise
-
-    def __enter__(self) -> TrialLog:
-        return self
 
     def __exit__(self, *exc: object) -> None:
         self._file.close()
@@ -374,7 +371,11 @@ class _RemainingTrials:
         if verdict.outcome == "repeat":
             self._log.end(trial.number, attempt, {"again": verdict.note, "cause": "operator"}, {})
             return
-        self._record(trial, attempt, played, verdict, played.judged(verdict, score))
+        # A partial success counts as a failure in success rates; its score is stored as the return.
+        success, steps = verdict.outcome == "success", played.result.steps
+        found = {"success_once": success, "success_at_end": success, "first_success": steps if success else None}
+        result = dataclasses.replace(played.result, **found, episode_return=score)
+        self._record(trial, attempt, played, verdict, result)
 
     def _record(self, trial: Trial, attempt: int, played: PlayedTrial, verdict: Verdict, result: EpisodeResult) -> None:
         seen = {

@@ -20,7 +20,7 @@ from vlagents_ray.evaluate.episode.records import EpisodeResult
 from vlagents_ray.evaluate.plan.cases import EvalCase
 from vlagents_ray.evaluate.plan.config import RobotConfig, canonical
 from vlagents_ray.evaluate.plan.jobs import EpisodeKey, Job
-from vlagents_ray.evaluate.robot.operator import Operator, Verdict
+from vlagents_ray.evaluate.robot.operator import Operator
 from vlagents_ray.evaluate.workers.rollout import AgentFactory
 from vlagents_ray.interface import Act, Agent, Obs
 from vlagents_ray.naming import plain
@@ -96,20 +96,6 @@ class PlayedTrial:
     result: EpisodeResult  # without success
     metadata: dict[str, Any]  # of the policy's server
     ending: str  # in words that do not depend on the policy
-
-    def judged(self, verdict: Verdict, score: float) -> EpisodeResult:
-        """Return the result with the verdict.
-
-        A partial success counts as a failure in success rates; its score is stored as the return.
-        """
-        success = verdict.outcome == "success"
-        return replace(
-            self.result,
-            success_once=success,
-            success_at_end=success,
-            first_success=self.result.steps if success else None,
-            episode_return=score,
-        )
 
 
 class WatchedRobot(Robot):

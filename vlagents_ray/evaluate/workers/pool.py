@@ -6,7 +6,7 @@ import contextlib
 import functools
 import logging
 import threading
-from abc import ABC, abstractmethod
+from abc import abstractmethod
 from collections import Counter
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
@@ -15,7 +15,6 @@ from typing import Any
 
 import ray
 from ray.exceptions import RayActorError, RayError
-from typing_extensions import Self
 
 from vlagents_ray.client.credentials import Credentials
 from vlagents_ray.errors import ClusterLost, EnvFailed, PolicyFailed, VLAgentsError, from_code
@@ -59,7 +58,7 @@ class WorkerHandle:
     node: str | None = None  # Ray's id of the node it runs on or, while it starts, is requested on; None: any node
 
 
-class Workers(ABC):
+class Workers(contextlib.AbstractContextManager["Workers"]):
     """The workers of an evaluation, wherever they play. Use it as a context manager, whose end ends them."""
 
     def __init__(self) -> None:
@@ -102,12 +101,6 @@ class Workers(ABC):
     @abstractmethod
     def close(self) -> None:
         """Close the simulators of idle workers, as some need this for a clean exit."""
-
-    def __enter__(self) -> Self:
-        return self
-
-    @abstractmethod
-    def __exit__(self, kind: type[BaseException] | None, *_: object) -> None: ...
 
 
 def dispatch(pool: Workers, queue: JobQueue, begin: Callable[[tuple[Job, ...]], None] = lambda _jobs: None) -> None:
