@@ -98,7 +98,16 @@ def _resolve_policy(policy: PolicyConfig, parts: dict[str, ServeDeploySchema], *
     """Add name and URL to `policy`; add its deployment to `parts` unless a server has it."""
     url = policy.source if policy.source is not None and "://" in policy.source else policy.url
     if url is not None:
-        return policy.model_copy(update={"url": url, "source": None} | (_found(policy, url) if ask else {}))
+        found: dict[str, Any] = {"url": url, "source": None}
+        if ask:  # a result belongs to the served policy, not to an address
+            if policy.config:
+                names = sorted(policy.config)
+                raise ConfigError(f"policy {policy.name!r}: got {names}, but {url} has its settings already")
+            with RemoteAgent(url, connect_timeout_s=_STARTING_S) as agent:  # its server may be starting
+                said = agent.metadata
+            name = policy.name if "name" in policy.model_fields_set else said["policy"]
+            found |= {"name": name, "config": said.get("config", {}), "checkpoint": said.get("checkpoint")}
+        return policy.model_copy(update=found)
     if policy.source is None:
         raise ConfigError(f"policy {policy.name!r}: want `source`, a policy to serve, or the `url` of a server")
     part = policy_deployment(policy, policy.source, step_follows=bool(policy.steps))
@@ -117,13 +126,3 @@ def policy_deployment(policy: PolicyConfig, source: str, *, step_follows: bool =
     of_name = {"config": policy.config} if policy.config and not source.endswith(YAML_SUFFIXES) else None
     read = read_deployment(source, of_name, step_follows=step_follows)
     return with_settings(read, policy.config, steps=bool(policy.steps), step_follows=step_follows)
-
-
-def _found(policy: PolicyConfig, url: str) -> dict[str, Any]:
-    """Request the served policy: a result belongs to it, not to an address."""
-    if policy.config:
-        raise ConfigError(f"policy {policy.name!r}: got {sorted(policy.config)}, but {url} has its settings already")
-    with RemoteAgent(url, connect_timeout_s=_STARTING_S) as agent:  # its server may be starting
-        said = agent.metadata
-    name = policy.name if "name" in policy.model_fields_set else said["policy"]
-    return {"name": name, "config": said.get("config", {}), "checkpoint": said.get("checkpoint")}

@@ -192,28 +192,20 @@ def replay_command(
             return
         if episode is None:
             raise ConfigError(f"{folder}: holds results, and wants an episode: its key, or ENV#NUMBER")
-        same = _same(folder, episode, policy, out_dir, address)
-    raise typer.Exit(not same)
+        from vlagents_ray.cli.evaluation import play_one
+        from vlagents_ray.evaluate import Results
+        from vlagents_ray.evaluate.replay import compare, find
 
-
-def _same(folder: Path, episode: str, policy: str | None, out_dir: Path | None, address: str | None) -> bool:
-    """Play an episode again, print the differences, and return whether there are none."""
-    from vlagents_ray.cli.evaluation import play_one
-    from vlagents_ray.evaluate import Results
-    from vlagents_ray.evaluate.replay import compare, find
-
-    recorded = find(Results.load(folder), episode)
-    other: dict[str, Any] | None = None
-    if policy is not None:
-        other = {"source": policy, "url": None, "config": {}, "checkpoint": None}
-    into = out_dir or fresh(folder / "replays" / "replay")
-    summary = play_one(recorded.config(into, policy=other), address, recorded.number_and_seed)
-    found = compare(recorded, summary.results)
-    steps = recorded.episode.result.steps
-    lines = found or [f"the same: {steps} actions byte for byte, and what came of them"]
-    for line in [*lines, f"replay: {into}"]:
-        out.print(line)
-    return not found
+        recorded = find(Results.load(folder), episode)
+        other = None if policy is None else {"source": policy, "url": None, "config": {}, "checkpoint": None}
+        into = out_dir or fresh(folder / "replays" / "replay")
+        summary = play_one(recorded.config(into, policy=other), address, recorded.number_and_seed)
+        found = compare(recorded, summary.results)
+        steps = recorded.episode.result.steps
+        lines = found or [f"the same: {steps} actions byte for byte, and what came of them"]
+        for line in [*lines, f"replay: {into}"]:
+            out.print(line)
+    raise typer.Exit(bool(found))
 
 
 def replay_dataset(folder: Path, policy: str, into: Path, plan: ReplayPlan) -> None:

@@ -96,7 +96,15 @@ class TrainingEvaluation:
         begun = monotonic()
         try:
             if isinstance(agent := self._policy, str):
-                return self._play_served(agent, version)
+                transport, timeout_s = self._plan.policies[0].transport, self._plan.connect_timeout_s
+                with RemoteAgent(agent, transport=transport, connect_timeout_s=timeout_s) as remote:
+                    newest = (remote.metadata.get("policy_version") or {}).get("newest") or {}
+                if newest.get("version") != version:
+                    raise WeightsLost(
+                        f"version: got {version}, but the newest that {agent} acts with is {newest.get('version')}; "
+                        f"want what the last push returned, once `acknowledged` counts all replicas"
+                    )
+                return evaluate(self._of(PushedWeights(**newest), url=agent), progress=self._progress)
             pushed = PushedWeights(version=version, fingerprint=fingerprint(agent.parameters()))
             session = _EvaluatedSession(agent, AgentCopies(agent), pushed)
             with evaluation_mode(None if agent.trainable is None else attrgetter(agent.trainable)(agent)):
@@ -105,17 +113,6 @@ class TrainingEvaluation:
         finally:
             self._last_s = monotonic() - begun
             self._spent_s += self._last_s
-
-    def _play_served(self, url: str, version: int) -> Summary:
-        policy = self._plan.policies[0]
-        with RemoteAgent(url, transport=policy.transport, connect_timeout_s=self._plan.connect_timeout_s) as remote:
-            newest = (remote.metadata.get("policy_version") or {}).get("newest") or {}
-        if newest.get("version") != version:
-            raise WeightsLost(
-                f"version: got {version}, but the newest that {url} acts with is {newest.get('version')}; want what "
-                f"the last push returned, once `acknowledged` counts all replicas"
-            )
-        return evaluate(self._of(PushedWeights(**newest), url=url), progress=self._progress)
 
     def _of(self, pushed: PushedWeights, url: str | None = None) -> EvalConfig:
         policy = self._plan.policies[0].model_copy(update={"source": None, "url": url, "pushed_weights": pushed})

@@ -84,16 +84,14 @@ class Score:
         weights = _distinct(stated(cell, "weights") for cell in self.cells) + _distinct(map(pushed_of, self.cells))
         weights = weights or _distinct(stated(cell, "checkpoint") for cell in self.cells) or ["no digest reported"]
         errors = sum(one.status == "policy_error" for one in counted)
+        when = "some step" if self.metric == "success_once" else "the last step"
         return (
-            f"success rate in %, {_WHEN[self.metric]}; {rate.successes} of {rate.episodes} episodes, {kind} {low} to "
+            f"success rate in %, solved after {when}; {rate.successes} of {rate.episodes} episodes, {kind} {low} to "
             f"{high}; ended by an error of the policy: {errors}; seeds {seeds[0]} to {seeds[-1]}; "
             f"protocol: {protocol}; deviations: {'; '.join(odd[:_MOST_NOTED]) or 'none'}{more}; "
             f"weights: {', '.join(weights)}; "
             f"code: {', '.join(_distinct(_code(run.versions) for run in self.results.runs))}"
         )
-
-
-_WHEN = {"success_once": "solved after some step", "success_at_end": "solved after the last step"}
 
 
 def scores(results: Results) -> list[Score]:

@@ -68,15 +68,9 @@ class Workers(contextlib.AbstractContextManager["Workers"]):
     def busy(self) -> bool:
         return any(worker.jobs for worker in self._workers)
 
-    def working(self) -> Counter[str]:
-        return Counter(worker.jobs[0].cell.place for worker in self._workers if worker.jobs)
-
-    def kinds(self) -> Counter[str]:
-        return Counter(worker.kind for worker in self._workers)
-
-    def unoccupied(self) -> Counter[str]:
-        """Return the number of workers without jobs by kind; some may still be starting."""
-        return Counter(worker.kind for worker in self._workers if not worker.jobs)
+    def kinds(self, *, occupied: bool = True) -> Counter[str]:
+        """Return the number of workers by kind; with `occupied` False, of those without jobs, which may be starting."""
+        return Counter(worker.kind for worker in self._workers if occupied or not worker.jobs)
 
     def idle(self) -> list[WorkerHandle]:
         """Return the workers that can take a job."""
@@ -106,10 +100,11 @@ class Workers(contextlib.AbstractContextManager["Workers"]):
 def dispatch(pool: Workers, queue: JobQueue, begin: Callable[[tuple[Job, ...]], None] = lambda _jobs: None) -> None:
     """Hand waiting jobs to idle workers, and start workers while more are needed; `begin` is called with the jobs."""
     for worker in pool.idle():
-        if jobs := queue.take(worker.kind, worker.env_place, pool.working()):
+        working = Counter(one.jobs[0].cell.place for one in pool._workers if one.jobs)
+        if jobs := queue.take(worker.kind, worker.env_place, working):
             begin(jobs)
             pool.dispatch(worker, jobs)
-    while (cell := queue.needs_worker(pool.kinds(), pool.unoccupied())) is not None and pool.free_slot():
+    while (cell := queue.needs_worker(pool.kinds(), pool.kinds(occupied=False))) is not None and pool.free_slot():
         pool.start(cell)
 
 
