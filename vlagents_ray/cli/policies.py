@@ -6,7 +6,7 @@ import contextlib
 import math
 import os
 import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from functools import cache
 from typing import TYPE_CHECKING, Any
 
@@ -59,8 +59,14 @@ def served(config: EvalConfig, address: str | None = None, *, replica_per_gpu: b
                 )
             for part in parts.values():
                 require_packages(part)
-        if config.real_robot is None:
-            _require_match(config, parts)
+        policy_contract = cache(lambda application: stated_contract(parts[application]))
+        for cell in cells(config) if config.real_robot is None else ():
+            application = str(cell.policy.url).removeprefix("serve://")
+            if application in parts and (env := known_contract(cell.env, cell.suite.env_options)) is not None:
+                try:
+                    require_match(policy_contract(application), env)
+                except ContractMismatch as error:
+                    raise ContractMismatch(f"{cell.policy.name!r} in {cell.env!r}: {error}") from None
         check(config)
         if parts and replica_per_gpu:
             parts = spread_over_gpus(parts, kept=config.workers * most_gpus(config))
@@ -69,18 +75,6 @@ def served(config: EvalConfig, address: str | None = None, *, replica_per_gpu: b
             cpus = max(os.cpu_count() or 1, math.ceil(config.workers * most_cpus(config)))
             stack.enter_context(running_server(together(parts), address=address, num_cpus=cpus, ingress=False))
         yield config
-
-
-def _require_match(config: EvalConfig, parts: Mapping[str, ServeDeploySchema]) -> None:
-    """Raise `ContractMismatch` if a policy to be served does not fit an env, as far as both state their contracts."""
-    policy_contract = cache(lambda application: stated_contract(parts[application]))
-    for cell in cells(config):
-        application = str(cell.policy.url).removeprefix("serve://")
-        if application in parts and (env := known_contract(cell.env, cell.suite.env_options)) is not None:
-            try:
-                require_match(policy_contract(application), env)
-            except ContractMismatch as error:
-                raise ContractMismatch(f"{cell.policy.name!r} in {cell.env!r}: {error}") from None
 
 
 def resolve_policies(config: EvalConfig, *, ask: bool = True) -> tuple[EvalConfig, dict[str, ServeDeploySchema]]:

@@ -271,7 +271,18 @@ class Store(AbstractContextManager["Store"]):
                 db.executescript(f"BEGIN; {SCHEMA} PRAGMA user_version = {VERSION}; COMMIT;")
             require_readable(self._out, db)
             self._require_resumable(db, config)
-            self._note_cells(db, config)
+            stop = config.stop.model_dump_json() if config.stop else None
+            with db:
+                for cell in self.cells:
+                    identity = (cell.policy.name, cell.step, cell.suite.name, cell.env)
+                    extent = (cell.planned, canonical(cell.suite.seeds), stop)
+                    row = (cell.fingerprint, *identity, canonical(cell.settings), *extent, canonical(cell.program))
+                    db.execute(
+                        "INSERT INTO cells (cell, policy, step, suite, env, settings, planned, seeds, stop, program)"
+                        " VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?, ?)"
+                        " ON CONFLICT DO UPDATE SET planned = ?, seeds = ?, stop = ?",
+                        row + extent,
+                    )
         except BaseException:
             db.close()
             raise
@@ -324,19 +335,6 @@ class Store(AbstractContextManager["Store"]):
         rows = db.execute("SELECT DISTINCT policy, suite, env FROM cells WHERE cell IN (SELECT cell FROM episodes)")
         gone = [" ".join(filter(None, row)) for row in rows if row not in mine and (row[0] in policies or not trained)]
         return [Change("plan", name, "in it", None) for name in gone]
-
-    def _note_cells(self, db: sqlite3.Connection, config: EvalConfig) -> None:
-        stop = config.stop.model_dump_json() if config.stop else None
-        with db:
-            for cell in self.cells:
-                identity = (cell.policy.name, cell.step, cell.suite.name, cell.env)
-                extent = (cell.planned, canonical(cell.suite.seeds), stop)
-                db.execute(
-                    "INSERT INTO cells (cell, policy, step, suite, env, settings, planned, seeds, stop, program)"
-                    " VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?, ?)"
-                    " ON CONFLICT DO UPDATE SET planned = ?, seeds = ?, stop = ?",
-                    (cell.fingerprint, *identity, canonical(cell.settings), *extent, canonical(cell.program), *extent),
-                )
 
 
 def _differences(db: sqlite3.Connection, cell: EvalCase) -> list[str]:
