@@ -240,16 +240,12 @@ def group_of(name: tuple[str, str, str], cells: Sequence[CellResults]) -> Group:
         ),
         retries=sum(attempt.retried for cell in cells for attempt in cell.attempts),
         steps=sum(one.steps for one in finished),
-        mean_steps=_mean([one.steps for one in finished]),
-        mean_return=_mean([one.episode_return for one in finished]),
+        mean_steps=float(np.mean([one.steps for one in finished])) if finished else None,
+        mean_return=float(np.mean([one.episode_return for one in finished])) if finished else None,
         env_step_ms=median([one.env_step_ms for one in finished]),
         policy_ms=median([one.policy_ms for one in finished]),
         policy_p95_ms=median([one.policy_p95_ms for one in finished]),
     )
-
-
-def _mean(values: Sequence[float]) -> float | None:
-    return float(np.mean(values)) if values else None
 
 
 def median(values: Iterable[float | None]) -> float | None:
