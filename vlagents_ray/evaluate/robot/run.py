@@ -253,7 +253,7 @@ def evaluate_on_robot(
     factory = agent_factory or agents(config, None, "robot")
     if robot is None:
         robot = import_class("--robot", str(planned[0].on_robot[0].arm), ROBOT)()
-    watched = WatchedRobot(robot, operator)
+    watched = WatchedRobot(robot)
     with TrialLog(config, planned) as log:
         trials = schedule(planned, log.key)
         run = _RemainingTrials(config, operator, watched, factory, log, trials)

@@ -99,11 +99,10 @@ class PlayedTrial:
 
 
 class WatchedRobot(Robot):
-    """A robot whose errors become `EnvFailed`, and whose observations the operator sees."""
+    """A robot whose errors become `EnvFailed`."""
 
-    def __init__(self, robot: Robot, operator: Operator) -> None:
+    def __init__(self, robot: Robot) -> None:
         self._robot = robot
-        self._operator = operator
         self.simulated = getattr(robot, "simulated", False)
         self.stats: EpisodeStats | None = None  # of the running trial
 
