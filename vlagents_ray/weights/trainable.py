@@ -227,13 +227,16 @@ def to_host(groups: Iterable[Mapping[str, Any]], moved: list[tuple[Any, Any]]) -
     The tensors stay the same objects, with the same views and ties; until `from_host` they must not be read. After an
     error, the list has those that were moved.
     """
-    values = [value for named in groups for value in named.values()]
-    tensors = [value for value in values if _is_tensor(value) and value.device.type != "cpu"]
+    tensors = [value for named in groups for value in named.values() if _is_tensor(value) and _on_gpu(value)]
     storages = {value.untyped_storage().data_ptr(): value.untyped_storage() for value in tensors if value.numel()}
     for storage in storages.values():
         if storage.resizable():  # otherwise it belongs to another library or process
             moved.append((storage, sys.modules["torch"].UntypedStorage(storage.nbytes()).copy_(storage)))
             storage.resize_(0)
+
+
+def _on_gpu(value: Any) -> bool:
+    return bool(value.device.type != "cpu")
 
 
 def from_host(moved: list[tuple[Any, Any]]) -> None:
