@@ -103,8 +103,38 @@ def to_lerobot(
 
     def demonstrations() -> Iterator[_Demonstration]:
         for cell, episode in recorded:
-            one = _demonstration(results, cell, episode, cameras, state, environment_state, cut_idle, with_versions)
-            if len(one.actions):  # a policy that failed before it acted leaves an empty episode
+            path = str(episode.trajectory)
+            trajectory = Trajectory.load(results.file(path))
+            parts = parts_of(trajectory.state, trajectory.gripper is not None)
+            numbers = [part for part in parts if part != GRIPPER or trajectory.gripper is None]
+            environment = _chosen("environment_state", environment_state, numbers, cell.env)
+            others = [part for part in parts if part not in environment]
+            chosen = _chosen("state", others if state is None else state, parts, cell.env)
+            shown = _chosen("cameras", cameras, trajectory.cameras, cell.env)
+            videos = videos_of(Path(path), trajectory.cameras)
+            with_gripper = trajectory.gripper is not None and GRIPPER in chosen
+            named = {*chosen, *environment} - ({GRIPPER} if with_gripper else set())
+            kept = {part: values for part, values in trajectory.state.items() if part in named}
+            gripper = trajectory.gripper if with_gripper else None
+            frames = len(trajectory.actions)
+            if cut_idle:
+                moving = [trajectory.actions, *kept.values(), *([] if gripper is None else [gripper[:, np.newaxis]])]
+                frames = _frames_until_rest(trajectory.success, moving)
+            one = _Demonstration(
+                cell,
+                episode,
+                Contract.from_json(cell.contract),
+                trajectory.actions[:frames],
+                trajectory.rewards[:frames],
+                trajectory.success[:frames],
+                tuple(chosen),
+                tuple(environment),
+                {part: values[:frames] for part, values in kept.items()},
+                None if gripper is None else gripper[:frames],
+                trajectory.versions[:frames] if with_versions else None,
+                {camera: require_there(results.file(str(videos[camera]))) for camera in shown},
+            )
+            if frames:  # a policy that failed before it acted leaves an empty episode
                 yield one
 
     angles = _angles(demonstrations())
@@ -147,50 +177,6 @@ class _Demonstration:
 
 def _fps(cell: CellResults) -> float:
     return float(cell.contract.get("control_hz") or DEFAULT_FPS)
-
-
-def _demonstration(
-    results: Results,
-    cell: CellResults,
-    episode: Episode,
-    cameras: Sequence[str] | None,
-    state: Sequence[str] | None,
-    environment_state: Sequence[str],
-    cut_idle: bool,
-    with_versions: bool,
-) -> _Demonstration:
-    path = str(episode.trajectory)
-    trajectory = Trajectory.load(results.file(path))
-    parts = parts_of(trajectory.state, trajectory.gripper is not None)
-    numbers = [part for part in parts if part != GRIPPER or trajectory.gripper is None]
-    environment = _chosen("environment_state", environment_state, numbers, cell.env)
-    if state is None:
-        state = [part for part in parts if part not in environment]
-    chosen = _chosen("state", state, parts, cell.env)
-    shown = _chosen("cameras", cameras, trajectory.cameras, cell.env)
-    videos = videos_of(Path(path), trajectory.cameras)
-    with_gripper = trajectory.gripper is not None and GRIPPER in chosen
-    named = {*chosen, *environment} - ({GRIPPER} if with_gripper else set())
-    kept = {part: values for part, values in trajectory.state.items() if part in named}
-    gripper = trajectory.gripper if with_gripper else None
-    frames = len(trajectory.actions)
-    if cut_idle:
-        moving = [trajectory.actions, *kept.values(), *([] if gripper is None else [gripper[:, np.newaxis]])]
-        frames = _frames_until_rest(trajectory.success, moving)
-    return _Demonstration(
-        cell,
-        episode,
-        Contract.from_json(cell.contract),
-        trajectory.actions[:frames],
-        trajectory.rewards[:frames],
-        trajectory.success[:frames],
-        tuple(chosen),
-        tuple(environment),
-        {part: values[:frames] for part, values in kept.items()},
-        None if gripper is None else gripper[:frames],
-        trajectory.versions[:frames] if with_versions else None,
-        {camera: require_there(results.file(str(videos[camera]))) for camera in shown},
-    )
 
 
 def _chosen(option: str, wanted: Sequence[str] | None, known: Sequence[str], env: str) -> list[str]:

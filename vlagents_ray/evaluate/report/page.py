@@ -24,8 +24,9 @@ from vlagents_ray.evaluate.plan.config import EvalConfig
 from vlagents_ray.evaluate.report import charts
 from vlagents_ray.evaluate.report.charts import BarChart, duration, interval, number, percent, quantity
 from vlagents_ray.evaluate.report.episodes import AT_ONCE, Gallery, episodes, errors, failures
-from vlagents_ray.evaluate.report.success import compare_all, learning_curves, real_time_gaps, success_table
+from vlagents_ray.evaluate.report.success import compare_all, learning_curves, success_table, totals
 from vlagents_ray.evaluate.results.changes import Change
+from vlagents_ray.evaluate.results.comparison import clock_gaps
 from vlagents_ray.evaluate.results.reader import CellResults, Results, Run, by_timing, rate_of
 from vlagents_ray.evaluate.results.summary import Summary, median, pushed_of, stated, summarize
 
@@ -86,7 +87,7 @@ def report(summary: Summary, gallery: Gallery) -> str:
     sections = [
         Section("Success", "success", success_table(summary)),
         Section("Comparison", "comparison", compare_all(summary)),
-        Section("Gap to the synchronous score", "real_time", real_time_gaps(summary)),
+        Section("Gap to the synchronous score", "real_time", totals(clock_gaps(results))),
         Section("Learning curve", "learning_curve", learning_curves(summary)),
         Section("Latency", "latency", latency(summary)),
         Section("Failures", "failures", failures(results, gallery)),

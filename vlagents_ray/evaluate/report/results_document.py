@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import time
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -76,15 +77,10 @@ class ResultsDocument:
         """Return the state of the evaluation: "starting", or that of its last run."""
         return results.runs[-1].state if results is not None and results.runs else STARTING
 
-    def results(self) -> Results | None:
-        """Return the results as they are now; None if there are none yet."""
-        try:
-            return Results.load(self._out) if (self._out / FILE).is_file() else None
-        except ConfigError:  # the file is being made
-            return None
-
     def _describe(self) -> dict[str, Any]:
-        results = self.results()
+        results = None
+        with contextlib.suppress(ConfigError):  # the file is being made
+            results = Results.load(self._out) if (self._out / FILE).is_file() else None
         state = self.state(results)
         cells = () if results is None else results.cells
         contenders = [] if results is None else results.contenders
