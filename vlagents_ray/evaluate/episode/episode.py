@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import hashlib
 from collections import deque
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from time import perf_counter
@@ -341,25 +341,20 @@ def _reset_policy(agent: Agent, episodes: Sequence[_Episode], contract: Contract
     given = {**options, "env": keys[0].env}
     if hasattr(agent, "metadata"):  # a server also compares the contract, and answers 409
         given["contract"] = contract.to_json()
-    answers: Iterable[dict[str, Any] | Exception]
+    answers: list[dict[str, Any] | Exception] = []
     if isinstance(agent, RemoteAgent):
         try:
             answers = agent.reset_batch(first, texts, sessions, seeds=seeds, **given)  # type: ignore[arg-type]
         except VLAgentsError as error:
             answers = [error] * len(episodes)
     else:
-        answers = map(partial(_reset_session, given), sessions, first, texts, seeds)
+        for session, obs, text, seed in zip(sessions, first, texts, seeds, strict=True):
+            try:
+                answers.append(session.reset(obs, text, **{**given, "seed": seed}))
+            except Exception as error:  # noqa: BLE001 - becomes the outcome of the episode
+                answers.append(error)
     for episode, answer in zip(episodes, answers, strict=True):
         episode.began(answer)
-
-
-def _reset_session(
-    given: Mapping[str, Any], session: Agent, obs: Obs, text: str, seed: int
-) -> dict[str, Any] | Exception:
-    try:
-        return session.reset(obs, text, **{**given, "seed": seed})
-    except Exception as error:  # noqa: BLE001 - becomes the outcome of the episode
-        return error
 
 
 def _request_actions(agent: Agent, episodes: Sequence[_Episode], contract: Contract) -> None:
