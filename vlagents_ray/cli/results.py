@@ -197,7 +197,9 @@ def replay_command(
         from vlagents_ray.evaluate.replay import compare, find
 
         recorded = find(Results.load(folder), episode)
-        other = None if policy is None else {"source": policy, "url": None, "config": {}, "checkpoint": None}
+        other: dict[str, Any] | None = (
+            None if policy is None else {"source": policy, "url": None, "config": {}, "checkpoint": None}
+        )
         into = out_dir or fresh(folder / "replays" / "replay")
         summary = play_one(recorded.config(into, policy=other), address, recorded.number_and_seed)
         found = compare(recorded, summary.results)

@@ -270,7 +270,7 @@ class _Run:
         self.progress.episode(job.cell, result)
         self._left[job.key.settings] -= 1
         stopping = self._stopping.get(job.cell.fingerprint)
-        if stopping is not None and stopping.at is None:
+        if stopping is not None and not self._has_stopped(job):
             stopping.add(result)
             if stopping.at is not None:  # its outcomes suffice; running episodes are finished
                 dropped = self._queue.drop(job.cell.fingerprint)

@@ -373,8 +373,8 @@ class _RemainingTrials:
             return
         # A partial success counts as a failure in success rates; its score is stored as the return.
         success, steps = verdict.outcome == "success", played.result.steps
-        found = {"success_once": success, "success_at_end": success, "first_success": steps if success else None}
-        result = dataclasses.replace(played.result, **found, episode_return=score)
+        judged: dict[str, Any] = {"success_once": success, "success_at_end": success, "episode_return": score}
+        result = dataclasses.replace(played.result, first_success=steps if success else None, **judged)
         self._record(trial, attempt, played, verdict, result)
 
     def _record(self, trial: Trial, attempt: int, played: PlayedTrial, verdict: Verdict, result: EpisodeResult) -> None:
