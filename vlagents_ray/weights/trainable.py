@@ -316,14 +316,8 @@ def require_fit(held: Mapping[str, Any], pushed: Mapping[str, Any], *, partial: 
         faults += [f"{name!r}: missing; push it, or set partial=True" for name in held if name not in pushed]
     elif not pushed:
         faults += ["no value: push at least one"]
-    for name, value in ((name, value) for name, value in pushed.items() if name in held):
-        want = held[name]
-        if not is_array(value):
-            faults.append(f"{name!r}: got {type(value).__name__}, want an array")
-        elif tuple(value.shape) != tuple(want.shape):
-            faults.append(f"{name!r}: got shape {tuple(value.shape)}, want {tuple(want.shape)}")
-        elif _kind(dtype_name(value)) != _kind(dtype_name(want)):
-            faults.append(f"{name!r}: got {dtype_name(value)}, want {dtype_name(want)}")
+    # A variable with a value here would keep the learner's memory open as long as the error has this frame.
+    faults += [fault for name in pushed if name in held and (fault := _misfit(name, pushed[name], held[name]))]
     _refuse(faults)
 
 
@@ -351,6 +345,16 @@ def _refuse(faults: list[str]) -> None:
     if faults:
         more = f"; and {len(faults) - _SHOWN} more" if len(faults) > _SHOWN else ""
         raise InvalidWeights(f"weights, of which nothing was changed: {'; '.join(faults[:_SHOWN])}{more}")
+
+
+def _misfit(name: str, pushed: Any, held: Any) -> str | None:
+    if not is_array(pushed):
+        return f"{name!r}: got {type(pushed).__name__}, want an array"
+    if tuple(pushed.shape) != tuple(held.shape):
+        return f"{name!r}: got shape {tuple(pushed.shape)}, want {tuple(held.shape)}"
+    if _kind(dtype_name(pushed)) != _kind(dtype_name(held)):
+        return f"{name!r}: got {dtype_name(pushed)}, want {dtype_name(held)}"
+    return None
 
 
 def _kind(dtype: str) -> Any:
