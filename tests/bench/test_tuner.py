@@ -9,8 +9,7 @@ from typing import Any
 import pytest
 
 from tests.bench.test_tuning import record
-from vlagents_ray.bench.tuner import TunePlan, Tuner, VariantFailed
-from vlagents_ray.bench.tuning_choice import TuningGoal, choose
+from vlagents_ray.bench.tuner import TunePlan, Tuner, TuningGoal, VariantFailed, choose
 from vlagents_ray.errors import ConfigError
 from vlagents_ray.serve.config.deployment import ServerArgs
 

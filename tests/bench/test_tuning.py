@@ -9,8 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from vlagents_ray.bench.tuner import largest_difference, recorded_observations
-from vlagents_ray.bench.tuning_choice import (
+from vlagents_ray.bench.tuner import (
     GoalMissed,
     MeasuredPoint,
     TuningGoal,
@@ -19,6 +18,8 @@ from vlagents_ray.bench.tuning_choice import (
     chosen_settings,
     default_point,
     figures,
+    largest_difference,
+    recorded_observations,
 )
 from vlagents_ray.bench.tuning_process import load_observations, save_observations
 from vlagents_ray.errors import ConfigError

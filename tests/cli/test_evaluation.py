@@ -18,12 +18,10 @@ from eval_fakes import LINE, OTHER_LINE
 from in_process_evaluation import flat_config, play
 from typer.testing import CliRunner
 
-import vlagents_ray.evaluate
 from vlagents_ray.cli import evaluate as command
 from vlagents_ray.cli import evaluation as run
 from vlagents_ray.cli import policies
-from vlagents_ray.cli.evaluation import forecasts, print_plan
-from vlagents_ray.cli.live import live_address
+from vlagents_ray.cli.evaluation import forecasts, live_address, print_plan
 from vlagents_ray.cli.main import app
 from vlagents_ray.evaluate import EvalConfig, OutOfTime, PolicyConfig, Results, SuiteConfig, WorkerConfig
 from vlagents_ray.evaluate.episode.failures import Failure
@@ -81,8 +79,8 @@ def test_out_of_time_has_an_exit_status_of_its_own(monkeypatch: pytest.MonkeyPat
         ends.append(end_at)
         raise OutOfTime(SimpleNamespace(total=SimpleNamespace(episodes=3, planned=9), out=tmp_path))  # type: ignore[arg-type]
 
-    monkeypatch.setattr(vlagents_ray.evaluate, "evaluate", evaluate)
-    monkeypatch.setattr(vlagents_ray.evaluate, "print_summary", lambda *_: None)
+    monkeypatch.setattr(run, "evaluate", evaluate)
+    monkeypatch.setattr(run, "print_summary", lambda *_: None)
     monkeypatch.setattr(run, "served", lambda config, *_, **__: contextlib.nullcontext(config))
     words = [*WORDS, "--out", str(tmp_path / "out"), "--end-at", "2027-01-31T18:30+00:00"]
     done = CliRunner().invoke(app, words, env={"COLUMNS": "200"})
@@ -128,7 +126,7 @@ def lost(out: Path, **changes: Any) -> EvalConfig:
 def end_of(config: EvalConfig, monkeypatch: pytest.MonkeyPatch) -> tuple[int, str]:
     """The exit status of `eval` and what it said at last, after an evaluation that left these results."""
     summary = summarize(Results.load(config.out))
-    monkeypatch.setattr(vlagents_ray.evaluate, "evaluate", lambda *_args, **_options: summary)
+    monkeypatch.setattr(run, "evaluate", lambda *_args, **_options: summary)
     monkeypatch.setattr(command, "config_from_options", lambda *_: config)
     monkeypatch.setattr(run, "served", lambda config, *_, **__: contextlib.nullcontext(config))
     done = CliRunner().invoke(app, [*WORDS, "--out", str(config.out)], env={"COLUMNS": "200"})

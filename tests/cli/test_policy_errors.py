@@ -13,7 +13,6 @@ from eval_fakes import LINE, ToZero
 from in_process_evaluation import flat_config
 from typer.testing import CliRunner, Result
 
-import vlagents_ray.evaluate
 from vlagents_ray.cli import evaluate as command
 from vlagents_ray.cli import evaluation as run
 from vlagents_ray.cli.main import app
@@ -52,7 +51,7 @@ def eval_of(out: Path, agent: functools.partial[Agent], monkeypatch: pytest.Monk
     """Run the command in this process."""
     config = flat_config(**{"envs": [LINE], "episodes": 4, "out": out, "video": "none", **settings})
     played = functools.partial(evaluate, agent_factory=agent, in_process=True)
-    monkeypatch.setattr(vlagents_ray.evaluate, "evaluate", played, raising=False)
+    monkeypatch.setattr(run, "evaluate", played)
     monkeypatch.setattr(command, "config_from_options", lambda *_: config)
     monkeypatch.setattr(run, "served", lambda config, *_, **__: contextlib.nullcontext(config))
     return CliRunner().invoke(app, ["eval", LINE, "--policy", "http://127.0.0.1:9"], env={"COLUMNS": "300"})

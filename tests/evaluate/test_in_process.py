@@ -22,8 +22,8 @@ from vlagents_ray.errors import ClusterLost, ConfigError, EnvFailed
 from vlagents_ray.evaluate import EvalConfig, EvaluationInterrupted, Summary, evaluate, run
 from vlagents_ray.evaluate.episode.failures import Failure
 from vlagents_ray.evaluate.plan.jobs import Job
+from vlagents_ray.evaluate.workers.pool import InProcessWorkers
 from vlagents_ray.evaluate.workers.rollout import Report
-from vlagents_ray.evaluate.workers.worker import InProcessWorkers
 
 Config = Callable[..., EvalConfig]
 

@@ -19,7 +19,7 @@ from vlagents_ray.evaluate import EvalConfig, EvaluationInterrupted, Progress, S
 from vlagents_ray.evaluate.episode.records import EpisodeResult
 from vlagents_ray.evaluate.plan.cases import EvalCase
 from vlagents_ray.evaluate.results.store import Store
-from vlagents_ray.evaluate.workers import pool, rollout, worker
+from vlagents_ray.evaluate.workers import pool, rollout
 from vlagents_ray.evaluate.workers.cluster import ray_cluster
 from vlagents_ray.interface import Agent
 
@@ -40,8 +40,8 @@ def outcomes(config: EvalConfig) -> list[tuple[Any, ...]]:
 
 
 def impatient(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(worker, "WATCH_S", 0.1)
-    monkeypatch.setattr(worker, "GRACE_S", 0.2)
+    monkeypatch.setattr(pool, "WATCH_S", 0.1)
+    monkeypatch.setattr(pool, "GRACE_S", 0.2)
 
 
 def here(settings: EvalConfig, make: Callable[[], Agent] = ToZero) -> Summary:

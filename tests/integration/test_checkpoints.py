@@ -18,7 +18,7 @@ from tests.integration.test_sessions import TRANSPORTS, url
 from vlagents_ray import Obs, RemoteAgent
 from vlagents_ray.errors import CheckpointFailed, UnknownCheckpoint
 from vlagents_ray.evaluate import evaluate
-from vlagents_ray.evaluate.results.summary import checkpoint_of, weights_of
+from vlagents_ray.evaluate.results.summary import stated
 from vlagents_ray.policies.base.checkpoint_files import digest
 from vlagents_ray.serve.launch.deployment_file import deployment
 from vlagents_ray.serve.launch.server import Server
@@ -201,8 +201,8 @@ def test_every_replica_swaps_and_new_ones_begin_with_what_was_swapped_to(fresh: 
 def test_an_evaluation_says_by_which_checkpoint(fresh: Server, folder: Path, tmp_path: Path) -> None:
     settings = {"envs": ["eval_fakes:Line"], "policy_url": fresh.url, "episodes": 2, "video": "none"}
     summary = evaluate(flat_config(**settings, policy_options={"checkpoint_step": 3}, out=tmp_path / "results"))
-    assert [checkpoint_of(cell) for cell in summary.results.cells] == [str(folder / "3")]
-    assert [weights_of(cell) for cell in summary.results.cells] == [digest([folder / "3"])]
+    assert [stated(cell, "checkpoint") for cell in summary.results.cells] == [str(folder / "3")]
+    assert [stated(cell, "weights") for cell in summary.results.cells] == [digest([folder / "3"])]
     assert digest([folder / "3"]) in (tmp_path / "results" / "report.html").read_text()
     assert metadata(fresh)["weights"] == {"digest": digest([folder / "1"]), "revision": None}
     assert (summary.total.episodes, summary.total.policy_errors) == (2, 0)
@@ -216,4 +216,4 @@ def test_a_sweep_evaluates_each_checkpoint_on_one_server(fresh: Server, folder: 
     settings = {"envs": ["eval_fakes:Line"], "policy_url": fresh.url, "episodes": 3, "video": "none", "workers": 2}
     summary = evaluate(flat_config(**settings, steps=[3, 4], out=tmp_path / "results"))
     assert [(group.contender, group.episodes) for group in summary.totals] == [("policy@3", 3), ("policy@4", 3)]
-    assert [checkpoint_of(cell) for cell in summary.results.cells] == [str(folder / "3"), str(folder / "4")]
+    assert [stated(cell, "checkpoint") for cell in summary.results.cells] == [str(folder / "3"), str(folder / "4")]

@@ -20,9 +20,9 @@ from vlagents_ray.evaluate.plan.cases import cells
 from vlagents_ray.evaluate.plan.jobs import EpisodeKey, Job, plan
 from vlagents_ray.evaluate.workers.rollout import Report, Rollout
 from vlagents_ray.interface import Act, Agent, Obs
-from vlagents_ray.learn import transitions as recording
+from vlagents_ray.learn import rollouts as recording
 from vlagents_ray.learn.columns import answers, arrays
-from vlagents_ray.learn.transitions import TransitionRecorder
+from vlagents_ray.learn.rollouts import TransitionRecorder
 
 
 class Stating(ToZero):

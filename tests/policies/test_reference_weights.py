@@ -13,7 +13,7 @@ from typing import Any
 import pytest
 
 from vlagents_ray.evaluate import EvalConfig, Results, SuiteConfig, evaluate
-from vlagents_ray.evaluate.bundle.verification import verify
+from vlagents_ray.evaluate.bundle import verify
 from vlagents_ray.evaluate.results.statistics import wilson
 from vlagents_ray.policies.reference import Reference
 

@@ -13,8 +13,7 @@ from pathlib import Path
 
 import pytest
 
-from vlagents_ray.slurm import submit_evaluation
-from vlagents_ray.slurm.training_hook import HookFailed
+from vlagents_ray.slurm import HookFailed, submit_evaluation
 
 WORDS = ["env/*", "--policy", "p", "--set", "checkpoint={checkpoint}", "--out", "runs/{step}"]
 PYTHON = """#!/bin/bash

@@ -13,8 +13,8 @@ from vlagents_ray.evaluate.artifacts.recorder import save
 from vlagents_ray.evaluate.artifacts.storage import versions
 from vlagents_ray.evaluate.plan.jobs import plan
 from vlagents_ray.evaluate.results.store import Store
+from vlagents_ray.evaluate.workers.pool import InProcessWorkers
 from vlagents_ray.evaluate.workers.rollout import Rollout
-from vlagents_ray.evaluate.workers.worker import InProcessWorkers
 from vlagents_ray.interface import Agent
 
 

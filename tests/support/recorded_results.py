@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from contextlib import closing
 from pathlib import Path
 from typing import Any
 
@@ -10,8 +11,8 @@ import numpy as np
 from eval_fakes import LINE, OTHER_LINE
 
 from vlagents_ray.evaluate import EvalConfig, Results
+from vlagents_ray.evaluate.artifacts.recorder import VideoRecorder, save_videos
 from vlagents_ray.evaluate.artifacts.storage import versions
-from vlagents_ray.evaluate.artifacts.video import VideoRecorder, save_videos
 from vlagents_ray.evaluate.episode.failures import Failure
 from vlagents_ray.evaluate.episode.records import EnvInfo, EpisodeResult, WorkerInfo
 from vlagents_ray.evaluate.plan.cases import EvalCase
@@ -94,7 +95,7 @@ def _trouble(store: Store, job: Job, *, lost: bool) -> None:
 
 
 def _video() -> dict[str, bytes]:
-    with VideoRecorder(10.0) as recorder:
+    with closing(VideoRecorder(10.0)) as recorder:
         for shade in range(0, 250, 50):
             recorder.add(Obs(cameras={"front": np.full((32, 48, 3), shade, np.uint8)}))
         return recorder.finish()

@@ -87,7 +87,7 @@ class MeasuredPolicy:
 
     def queued(self, size: int, seconds: float, rank: RankName) -> QueuedTurn:
         """Measure `size` sessions, each of which sends its next request as soon as the last one is answered."""
-        views = self._views(size)
+        views = [self._view(self.engine.contract, i) for i in range(size)]
         answers: queue.SimpleQueue[tuple[int, Reply]] = queue.SimpleQueue()
         asked = [0.0] * size
 
@@ -125,9 +125,6 @@ class MeasuredPolicy:
         # Each call counts its batch once for each of the batch's members: the harmonic mean is the batches' own.
         mean_batch = len(calls) / sum(1 / call[2] for call in calls)
         return QueuedTurn(rate_of([calls]), mean_batch, [call[1] * 1e3 for call in calls])
-
-    def _views(self, size: int) -> list[Obs]:
-        return [self._view(self.engine.contract, i) for i in range(size)]
 
     def _sessions(self, episodes: Sequence[int]) -> list[Agent]:
         sessions = [self._copies.make() for _ in episodes]

@@ -1,4 +1,4 @@
-"""Measures variants of a deployment file's settings, each in its own process, within a given time."""
+"""Measures variants of a deployment file's settings, each in its own process, within a given time, and chooses one."""
 
 from __future__ import annotations
 
@@ -11,19 +11,130 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import Any, get_args
+from typing import Any, Literal, get_args
 
 import numpy as np
 
 from vlagents_ray.bench.line_process import LineProcess, ProcessFailed, our_environment
-from vlagents_ray.bench.tuning_choice import MeasuredPoint, TuningGoal, Variant, sessions
 from vlagents_ray.bench.tuning_process import FRAMES, ProcessSettings, save_observations
 from vlagents_ray.errors import ConfigError, VLAgentsError
-from vlagents_ray.evaluate.artifacts.trajectory import Trajectory, videos_of
+from vlagents_ray.evaluate.artifacts.recorder import Trajectory, videos_of
 from vlagents_ray.interface import Obs
 from vlagents_ray.policies.compilation import Quantization
 from vlagents_ray.registry import require
-from vlagents_ray.serve.config.deployment import ServerArgs
+from vlagents_ray.serve.config.deployment import BatchArgs, ServerArgs
+
+_BETTER = 1.05  # factor by which a variant must be better than the file's own settings to replace them
+
+
+class GoalMissed(VLAgentsError):
+    """No measured settings reach the goal; the message has the nearest."""
+
+
+@dataclass(frozen=True, slots=True)
+class TuningGoal:
+    """The goal of `tune`: the most actions per second, or the most robots whose round trips are short enough."""
+
+    kind: Literal["throughput", "robots"]
+    p99_ms: float | None = None  # for robots: upper bound of the 99th percentile of round trips
+
+    def __post_init__(self) -> None:
+        if self.kind == "robots" and self.p99_ms is None:
+            raise ConfigError("--for robots: got no --p99-ms, want the longest round trip that your robots bear, ms")
+        if self.kind == "throughput" and self.p99_ms is not None:
+            raise ConfigError("--p99-ms: is for --for robots; leave it out")
+
+
+@dataclass(frozen=True, slots=True)
+class Variant:
+    """The file's own settings of the policy, or changes to them."""
+
+    changes: Mapping[str, Any] = field(default_factory=dict)
+
+    @property
+    def name(self) -> str:
+        """The changes in words, without the batch sizes, which have their own column in the table."""
+        shown = {key: value for key, value in self.changes.items() if key != "batch_sizes"}
+        words = [f"{key}: {str(value).lower() if isinstance(value, bool) else value}" for key, value in shown.items()]
+        return ", ".join(words) or "own settings"
+
+
+@dataclass(frozen=True, slots=True)
+class MeasuredPoint:
+    """The figures of one variant and one number of sessions, which equals its batch size."""
+
+    variant: Variant
+    sessions: int
+    actions_per_s: float
+    round_trip_ms: float  # the median
+    p99_ms: float
+    peak_mib: float
+    difference: float  # largest difference from the actions of the file's own settings, as a share of their range
+
+    def reaches(self, goal: TuningGoal) -> bool:
+        """Return whether round trips are short enough for robots, if that is the goal."""
+        return goal.p99_ms is None or self.p99_ms <= goal.p99_ms
+
+
+def sessions(number: int) -> str:
+    """Return a number of sessions in words."""
+    return f"{number} session{'s' if number > 1 else ''}"
+
+
+def choose(points: Sequence[MeasuredPoint], goal: TuningGoal) -> MeasuredPoint:
+    """Choose the best point for a goal.
+
+    A variant must be 5 % better than one with fewer changes, or serve more robots.
+    """
+    reaching = [point for point in points if point.reaches(goal)]
+    if not reaching and not points:
+        raise GoalMissed("no settings could be measured")
+    if not reaching:
+        found = min(points, key=lambda point: point.p99_ms)
+        raise GoalMissed(
+            f"--p99-ms: got {goal.p99_ms}; the shortest p99 of a round trip was {found.p99_ms:.1f} ms, with "
+            f"{sessions(found.sessions)} and {found.variant.name}; raise --p99-ms, or use a faster machine or model"
+        )
+    variants = sorted({point.variant.name: point.variant for point in reaching}.values(), key=lambda v: len(v.changes))
+    reached = lambda point: point.actions_per_s if goal.kind == "throughput" else point.sessions  # noqa: E731
+    best, *others = (max((one for one in reaching if one.variant is variant), key=reached) for variant in variants)
+    for other in others:
+        is_better = other.actions_per_s > _BETTER * best.actions_per_s
+        if goal.kind == "robots":
+            is_better = (other.sessions, 0.0) > (best.sessions, other.p99_ms * _BETTER - best.p99_ms)
+        best = other if is_better else best
+    return best
+
+
+def default_point(points: Sequence[MeasuredPoint], goal: TuningGoal, max_size: int) -> MeasuredPoint | None:
+    """Return the figures of the unchanged file; None if they were not measured, or miss the goal."""
+    own = [point for point in points if not point.variant.changes and point.sessions <= max_size]
+    if goal.kind == "throughput":
+        own = [point for point in own if point.sessions == max_size]
+    return max((one for one in own if one.reaches(goal)), key=lambda point: point.sessions, default=None)
+
+
+def chosen_settings(chosen: MeasuredPoint, batch: BatchArgs, fixed: Sequence[int] | None) -> dict[str, dict[str, Any]]:
+    """Return the settings of a deployment file to change, by section and key below `args`."""
+    config, queue = dict(chosen.variant.changes), dict[str, Any]()
+    sizes = chosen.variant.changes.get("batch_sizes", fixed)
+    if sizes and sizes[-1] > chosen.sessions:
+        config["batch_sizes"] = [*(size for size in sizes if size < chosen.sessions), chosen.sessions]
+    if chosen.sessions != batch.max_size and batch.sizes is not None:
+        queue["sizes"] = [size for size in batch.sizes if size <= chosen.sessions]
+    elif chosen.sessions != batch.max_size:
+        queue["max_size"] = chosen.sessions
+    return {section: values for section, values in (("config", config), ("batch", queue)) if values}
+
+
+def figures(points: Sequence[MeasuredPoint]) -> list[list[str]]:
+    """Return a table of the measurements, with its header as the first row."""
+    rows = [["settings", "sessions", "actions/s", "round trip ms", "p99 ms", "peak MiB", "actions off by"]]
+    for one in points:
+        numbers = [f"{one.actions_per_s:.1f}", f"{one.round_trip_ms:.1f}", f"{one.p99_ms:.1f}", f"{one.peak_mib:.0f}"]
+        rows.append([one.variant.name, str(one.sessions), *numbers, f"{one.difference:.3%}"])
+    return rows
+
 
 _RISING = 1.05  # factor by which two larger batches must raise the rate before a still larger one is measured
 _TURNS = 3
@@ -100,7 +211,9 @@ class Tuner:
                 frames = Path(folder) / "frames.npz"
                 save_observations(recorded_observations(self._plan.frames, FRAMES), frames)
             ready = self._measure_own(frames)
-            variants = self._variants(ready, self._useful())
+            rates = {size.sessions: statistics.median(size.rates) for size in self._sizes}
+            most = max(rates, key=rates.__getitem__) if self._plan.goal.kind == "throughput" else max(rates)
+            variants = self._variants(ready, sorted(size for size in rates if size <= most))
             for number, variant in enumerate(variants):
                 self._try(variant, frames, parts=len(variants) - number)
         return [size.point() for size in self._sizes]
@@ -143,12 +256,6 @@ class Tuner:
         compiled = [{"compile": mode} | ({"batch_sizes": list(sizes)} if mode and free else {}) for mode in modes]
         both = [one | other for other in compiled for one in dtypes]
         return [Variant(changes) for changes in [*dtypes, *compiled, *both]]
-
-    def _useful(self) -> list[int]:
-        """Return the measured sizes; for throughput, up to the one with the largest rate."""
-        rates = {size.sessions: statistics.median(size.rates) for size in self._sizes}
-        most = max(rates, key=rates.__getitem__) if self._plan.goal.kind == "throughput" else max(rates)
-        return sorted(size for size in rates if size <= most)
 
     def _try(self, variant: Variant, frames: Path | None, parts: int) -> None:
         """Measure a variant, or report its failure."""
@@ -229,7 +336,13 @@ class Tuner:
         try:
             difference = largest_difference(self._actions(process, size), self._wanted)
             if difference > self._plan.tolerance:
-                raise VariantFailed(self._refusal(difference, itself=not variant.changes and not found))
+                off = f"actions differ by {difference:.2%} of their range, want at most {self._plan.tolerance:.2%}"
+                if variant.changes or found:
+                    raise VariantFailed(f"refused, as {off}")
+                raise VariantFailed(
+                    f"{off}, for the same observations and seeds, so that nothing can be compared with them; let the "
+                    f"seed of `reset` determine what is random in the policy, or raise --tolerance"
+                )
             measured = TunedSize(variant, size, difference)
             measured.add(self._turn(process, size))
         except VariantFailed as error:
@@ -243,25 +356,14 @@ class Tuner:
         self._progress(f"{variant.name}, {sessions(size)}: {measured.rates[0]:.1f} actions/s")
         return True
 
-    def _refusal(self, difference: float, *, itself: bool) -> str:
-        off = f"actions differ by {difference:.2%} of their range, want at most {self._plan.tolerance:.2%}"
-        if itself:
-            return (
-                f"{off}, for the same observations and seeds, so that nothing can be compared with them; let the seed "
-                f"of `reset` determine what is random in the policy, or raise --tolerance"
-            )
-        return f"refused, as {off}"
-
     def _actions(self, process: LineProcess, size: int) -> list[np.ndarray]:
-        said = self._request(process, {"act": size})
+        process.send(json.dumps({"act": size}))
+        said = self._answer(process)
         return [np.array(action, np.float64) for action in said["actions"]]
 
     def _turn(self, process: LineProcess, number: int) -> dict[str, Any]:
         rank = "robot" if self._plan.goal.kind == "robots" else "simulation"
-        return self._request(process, {"measure": number, "seconds": self._plan.seconds, "rank": rank})
-
-    def _request(self, process: LineProcess, asked: Mapping[str, Any]) -> dict[str, Any]:
-        process.send(json.dumps(asked))
+        process.send(json.dumps({"measure": number, "seconds": self._plan.seconds, "rank": rank}))
         return self._answer(process)
 
     def _answer(self, process: LineProcess) -> dict[str, Any]:
@@ -310,23 +412,18 @@ def recorded_observations(folder: Path, count: int) -> list[Obs]:
     used = files[:: max(1, len(files) // count)][:count]
     found: list[Obs] = []
     for number, file in enumerate(used):
-        share = len(range(number, count, len(used)))
-        found += _of_trajectory(file, share)
+        share, trajectory = len(range(number, count, len(used))), Trajectory.load(file)
+        steps = np.linspace(0, len(trajectory.actions), share, dtype=int).tolist()
+        images = {camera: _images(video, steps) for camera, video in videos_of(file, trajectory.cameras).items()}
+        found += [
+            Obs(
+                cameras={camera: images[camera][step] for camera in trajectory.cameras},
+                gripper=None if trajectory.gripper is None else float(trajectory.gripper[step]),
+                state={part: values[step] for part, values in trajectory.state.items()},
+            )
+            for step in steps
+        ]
     return found
-
-
-def _of_trajectory(file: Path, count: int) -> list[Obs]:
-    trajectory = Trajectory.load(file)
-    steps = np.linspace(0, len(trajectory.actions), count, dtype=int).tolist()
-    images = {camera: _images(video, steps) for camera, video in videos_of(file, trajectory.cameras).items()}
-    return [
-        Obs(
-            cameras={camera: images[camera][step] for camera in trajectory.cameras},
-            gripper=None if trajectory.gripper is None else float(trajectory.gripper[step]),
-            state={part: values[step] for part, values in trajectory.state.items()},
-        )
-        for step in steps
-    ]
 
 
 def _images(video: Path, steps: list[int]) -> dict[int, np.ndarray]:

@@ -95,31 +95,34 @@ def _serve(settings: ProcessSettings, answer: Callable[[Mapping[str, Any]], None
         batch_sizes=settings.batch_sizes,
         on_step=lambda step: answer({"step": step}),
     )
+    while isinstance(agent, Wrapper):
+        agent = agent.agent
     with measured:
-        uncompiled = measured.engine.models.uncompiled
+        uncompiled, config = measured.engine.models.uncompiled, getattr(agent, "config", None)
+        has = {name: getattr(config, name) for name in _TUNED if name in getattr(type(config), "model_fields", {})}
+        dtypes = [] if jax_device() is None else ["bfloat16"]  # that the accelerator computes without emulation
+        if (used := cuda()) is not None:
+            dtypes = ["bfloat16" if used.get_device_capability() >= (8, 0) else "float16"]
         answer({
             "device": device_name(), "load_s": measured.load_s, "uncompiled": uncompiled,
-            "settings": _settings_of(agent), "dtypes": _native_dtypes(),
-            "modes": [False, True] if cuda() is None else [False, "graphs", True],  # of `compile`
+            "settings": has, "dtypes": dtypes,
+            "modes": [False, True] if used is None else [False, "graphs", True],  # of `compile`
         })  # fmt: skip
         for line in sys.stdin:
             try:
-                said = _answered(measured, json.loads(line))
+                asked = json.loads(line)
+                if "act" in asked:
+                    said: dict[str, Any] = {
+                        "actions": [action.tolist() for action in measured.actions(asked["act"], FRAMES)]
+                    }
+                else:
+                    forget_peak()
+                    turn = measured.queued(asked["measure"], asked["seconds"], asked["rank"])
+                    trips_ms = [round(trip, 4) for trip in turn.trips_ms]
+                    said = {"actions_per_s": turn.actions_per_s, "trips_ms": trips_ms, "peak_mib": peak_mib()}
             except Exception as error:  # noqa: BLE001 - as above; smaller batches may still work
                 said = {"failed": _sentence(error)}
             answer(said)
-
-
-def _answered(measured: MeasuredPolicy, asked: Mapping[str, Any]) -> dict[str, Any]:
-    if "act" in asked:
-        return {"actions": [action.tolist() for action in measured.actions(asked["act"], FRAMES)]}
-    forget_peak()
-    turn = measured.queued(asked["measure"], asked["seconds"], asked["rank"])
-    return {
-        "actions_per_s": turn.actions_per_s,
-        "trips_ms": [round(trip, 4) for trip in turn.trips_ms],
-        "peak_mib": peak_mib(),
-    }
 
 
 def _views(settings: ProcessSettings) -> Callable[[Contract | None, int], Obs]:
@@ -133,21 +136,6 @@ def _views(settings: ProcessSettings) -> Callable[[Contract | None, int], Obs]:
         return obs
 
     return view
-
-
-def _settings_of(agent: Agent) -> dict[str, Any]:
-    """Return the values of the settings that the policy has and `tune` may change."""
-    while isinstance(agent, Wrapper):
-        agent = agent.agent
-    config = getattr(agent, "config", None)
-    return {name: getattr(config, name) for name in _TUNED if name in getattr(type(config), "model_fields", {})}
-
-
-def _native_dtypes() -> list[str]:
-    """Return the 16-bit types in which the policy's accelerator computes without emulation."""
-    if (used := cuda()) is not None:
-        return ["bfloat16" if used.get_device_capability() >= (8, 0) else "float16"]
-    return [] if jax_device() is None else ["bfloat16"]
 
 
 def _sentence(error: BaseException) -> str:

@@ -60,7 +60,12 @@ def errors() -> Iterator[None]:
         with interrupts():
             yield
     except ValidationError as error:
-        fail(f"wrong settings: {wrong_settings(error, *_model_of(error))}", 2)
+        from vlagents_ray.evaluate import EvalConfig
+        from vlagents_ray.evaluate.exports.scores import HubSettings
+
+        models = {EvalConfig: None, HubSettings: "--set"}  # that users write, and the options that set their fields
+        known = next(((one, option) for one, option in models.items() if one.__name__ == error.title), (None, None))
+        fail(f"wrong settings: {wrong_settings(error, *known)}", 2)
     except ConfigError as error:
         fail(str(error), 2)
     except ClusterLost as error:
@@ -72,15 +77,6 @@ def errors() -> Iterator[None]:
         fail(f"{type(error).__name__}: {error}", 1)
     except KeyboardInterrupt as error:
         fail(str(error) or "interrupted", 130)
-
-
-def _model_of(error: ValidationError) -> tuple[type | None, str | None]:
-    """Return the model of these settings, if users write it, and the option that sets its fields."""
-    from vlagents_ray.evaluate import EvalConfig
-    from vlagents_ray.evaluate.exports.scores import HubSettings
-
-    options = {EvalConfig: None, HubSettings: "--set"}
-    return next(((model, option) for model, option in options.items() if model.__name__ == error.title), (None, None))
 
 
 def fail(message: str, code: int) -> NoReturn:

@@ -18,14 +18,16 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
+from rich.console import Console
+from rich.text import Text
+
+from vlagents_ray.cli.console import table
 from vlagents_ray.errors import MissingDependency
 from vlagents_ray.policies.base.accelerator import OLDEST_DRIVERS, driver_version
 from vlagents_ray.registry import require
 from vlagents_ray.serve.python_env.create import has_gpu
 
 if TYPE_CHECKING:
-    from rich.console import Console
-
     from vlagents_ray.envs.render_probe import RenderProbe
 
 
@@ -172,19 +174,13 @@ def port_free(port: int) -> Check:
 
 def run(console: Console, port: int = DEFAULT_PORT, pythons: Sequence[Path] = ()) -> int:
     """Print a row for each check, see `checks`. Returns the exit code: 1 if any check failed, else 0."""
-    from rich.table import Table
-    from rich.text import Text
-
-    table = Table(box=None, header_style="bold", pad_edge=False)
-    for column in ("check", "", "found", "cure"):
-        table.add_column(column, overflow="fold")
+    rows = table("check", "", "found", "cure", box=None, header_style="bold", pad_edge=False)
     failed = False
     with console.status("looking around; rendering a frame takes some seconds"):
         for name, check in checks(port, pythons):
             failed |= check.status == "fail"
-            style = _STYLE[check.status]
-            table.add_row(name, Text(check.status, style), Text(check.detail), Text(check.cure))
-    console.print(table, width=None if console.is_terminal else _WIDTH)
+            rows.add_row(name, Text(check.status, _STYLE[check.status]), Text(check.detail), Text(check.cure))
+    console.print(rows, width=None if console.is_terminal else _WIDTH)
     return int(failed)
 
 

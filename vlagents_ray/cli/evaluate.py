@@ -147,8 +147,7 @@ def evaluate_command(options: EvalOptions) -> None:
         config = config_from_options(options)
         on_robot = config.real_robot is not None
         options.require_together(on_robot=on_robot)
-        from vlagents_ray.cli.evaluation import print_plan, run_evaluation, run_on_robot, watch_training
-        from vlagents_ray.cli.live import live_address
+        from vlagents_ray.cli.evaluation import live_address, print_plan, run_evaluation, run_on_robot, watch_training
 
         address, page = options.address, live_address(options.live_at) if options.live or options.live_at else None
         if on_robot:
@@ -195,7 +194,15 @@ def config_from_options(options: EvalOptions) -> EvalConfig:
         fields = {"policies": [policy], "suites": [{"envs": list(what)} | suite], **run}
     if options.arm is not None:
         fields["robot"] = {**(fields.get("robot") or {}), "arm": options.arm}
-    return _with_resources(EvalConfig.model_validate(fields), worker)
+    config = EvalConfig.model_validate(fields)
+
+    def filled(of: WorkerConfig) -> WorkerConfig:  # with the resources that are not in the configuration
+        return of.model_copy(update={name: value for name, value in worker.items() if name not in of.model_fields_set})
+
+    suites = [
+        one if one.worker is None else one.model_copy(update={"worker": filled(one.worker)}) for one in config.suites
+    ]
+    return config.model_copy(update={"worker": filled(config.worker), "suites": suites}) if worker else config
 
 
 def _given(options: dict[str, Any], model: type[BaseModel]) -> dict[str, Any]:
@@ -203,22 +210,6 @@ def _given(options: dict[str, Any], model: type[BaseModel]) -> dict[str, Any]:
     found = {name: options[name] for name in model.model_fields if name in options}
     # 0 was given, though it equals False.
     return {name: value for name, value in found.items() if value not in (None, {}, []) and value is not False}
-
-
-def _with_resources(config: EvalConfig, resources: dict[str, float]) -> EvalConfig:
-    """Set these resources for each worker without resources in the configuration."""
-    if not resources:
-        return config
-
-    def filled(worker: WorkerConfig) -> WorkerConfig:
-        unset = {name: value for name, value in resources.items() if name not in worker.model_fields_set}
-        return worker.model_copy(update=unset)
-
-    suites = [
-        suite if suite.worker is None else suite.model_copy(update={"worker": filled(suite.worker)})
-        for suite in config.suites
-    ]
-    return config.model_copy(update={"worker": filled(config.worker), "suites": suites})
 
 
 def read_run(file: Path) -> dict[str, Any]:

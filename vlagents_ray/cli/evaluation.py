@@ -1,16 +1,18 @@
-"""Evaluations from the command line by their configuration: played, planned, watched, or on a robot."""
+"""Evaluations by their configuration: played, planned, watched or on a robot, and the live page of `--live`."""
 
 from __future__ import annotations
 
 import contextlib
 import datetime
 import threading
-from collections.abc import Sequence
-from contextlib import AbstractContextManager
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
+from urllib.parse import urlsplit
 
+import ray
+import typer
 from rich.box import SIMPLE_HEAD
 from rich.table import Table
 
@@ -18,23 +20,92 @@ from vlagents_ray.cli.console import fail, out
 from vlagents_ray.cli.listing import require_packages
 from vlagents_ray.cli.policies import policy_deployment, resolve_policies, served
 from vlagents_ray.errors import ConfigError, PolicyFailed
-from vlagents_ray.evaluate import EvalConfig, PolicyConfig, Results
+from vlagents_ray.evaluate import (
+    EvalConfig,
+    EvaluationInterrupted,
+    OutOfTime,
+    Progress,
+    Results,
+    Summary,
+    evaluate,
+    print_summary,
+    progress_for,
+)
 from vlagents_ray.evaluate.checkpoint_watcher import CheckpointWatcher, rounds
 from vlagents_ray.evaluate.plan.cases import EvalCase, cells
 from vlagents_ray.evaluate.plan.jobs import plan
+from vlagents_ray.evaluate.report.results_document import ProgressDocument, ResultsDocument
 from vlagents_ray.evaluate.results.database import FILE
+from vlagents_ray.evaluate.results.summary import errors_of_policies, failing_cells, summarize
 from vlagents_ray.evaluate.workers.cluster import ray_cluster
 from vlagents_ray.policies.base.checkpoint import STEP
+from vlagents_ray.serve.access.api_keys import load_keys
 from vlagents_ray.serve.launch.deployment_file import own_settings
 from vlagents_ray.serve.models.checkpoints import CHOICE
+from vlagents_ray.serve.observers.live_page import page_server, require_watch_keys
+from vlagents_ray.serve.observers.live_view import Fleet
+from vlagents_ray.serve.ports import LOOPBACK, is_free
+from vlagents_ray.serve.scaling.sibling_replicas import ReplicasInCluster
 from vlagents_ray.slurm.submission import UNFINISHED
-
-if TYPE_CHECKING:
-    from vlagents_ray.evaluate import Progress, Summary
-
 
 POLICY_ERRORS = 3  # exit status: an error of the policy ended every episode of a cell
 LOOK_S = 1.0  # period at which the folder is read
+_PORT = 8050  # of the page, if it is free
+_NAME = "eval"  # the page's application, for keys that are limited to applications
+
+
+def live_address(at: str | None) -> tuple[str, int]:
+    """Return the (host, port) that `--live-at` states; None is `--live` alone."""
+    if at is None:
+        return LOOPBACK, _PORT if is_free(LOOPBACK, _PORT) else 0
+    try:
+        parts = urlsplit(f"//{at}")
+        host, port = parts.hostname, parts.port
+    except ValueError:
+        host = port = None
+    if host is None or port is None or parts.netloc != at:
+        raise ConfigError(f"--live-at: got {at!r}, want HOST:PORT, as in 127.0.0.1:{_PORT}")
+    require_watch_keys(host, load_keys())  # before anything is served
+    return host, port
+
+
+@contextlib.contextmanager
+def shown_progress(config: EvalConfig, live: tuple[str, int] | None, *, goes_on: bool = False) -> Iterator[Progress]:
+    """Show an evaluation on the terminal and, if that has an address, on the live page, within the context of its Ray.
+
+    Yields:
+        The progress to evaluate with.
+    """
+    if live is None:
+        yield progress_for(out)
+        return
+    document = ProgressDocument(config.out, progress_for(out), goes_on=goes_on)
+    urls = [str(one.url) for one in config.policies]
+    apps = [url.removeprefix("serve://") for url in urls if url.startswith("serve://")]
+    others = ReplicasInCluster(apps) if apps and ray.is_initialized() else None
+    with _page(document, others, live):
+        try:
+            yield document
+        except Exception as error:
+            if not isinstance(error, typer.Exit):
+                document.fail(str(error))
+            raise
+        finally:
+            document.close()
+
+
+def follow(results: Path, address: tuple[str, int]) -> None:
+    """Serve the page of an evaluation or a training that another process writes to a folder, until Ctrl-C."""
+    with _page(ResultsDocument(results), None, address), contextlib.suppress(KeyboardInterrupt):
+        threading.Event().wait()
+
+
+@contextlib.contextmanager
+def _page(document: ResultsDocument, others: ReplicasInCluster | None, address: tuple[str, int]) -> Iterator[None]:
+    fleet = Fleet(None, others, document.read)
+    with page_server(fleet, address, load_keys(), name=_NAME, videos=document.video) as url:
+        out.print(f"live: {url}")
+        yield
 
 
 def run_evaluation(
@@ -47,36 +118,21 @@ def run_evaluation(
 ) -> None:
     """Serve the policies that are not at a URL, evaluate them all, print the table.
 
-    `end_at` is as in `evaluate`, and `live` the address of the live page, as for `live_progress`.
+    `end_at` is as in `evaluate`, and `live` the address of the live page, as for `shown_progress`.
     """
     with served(config, address, replica_per_gpu=replica_per_gpu) as ready, shown_progress(ready, live) as progress:
         summary = evaluate_and_print(ready, progress, end_at)
     require_results(ready, summary)
 
 
-def shown_progress(
-    config: EvalConfig, live: tuple[str, int] | None, *, goes_on: bool = False
-) -> AbstractContextManager[Progress]:
-    """Return the progress of an evaluation: on the terminal, and on the live page if that has an address."""
-    from vlagents_ray.cli.live import live_progress
-    from vlagents_ray.evaluate import progress_for
-
-    return live_progress(config.out, [one.url for one in config.policies], live, progress_for(out), goes_on=goes_on)
-
-
 def play_one(config: EvalConfig, address: str | None, only: tuple[int, int]) -> Summary:
     """Serve the policy unless it is at a URL, and play one episode of it; `only` as in `evaluate`."""
-    from vlagents_ray.evaluate import evaluate, progress_for
-
     with served(config, address) as ready:
         return evaluate(ready, progress=progress_for(out), only=only)
 
 
 def evaluate_and_print(config: EvalConfig, progress: Progress, end_at: float | None = None) -> Summary:
     """Evaluate policies at their URLs; an interrupted evaluation prints its results so far."""
-    from vlagents_ray.evaluate import EvaluationInterrupted, OutOfTime, Results, evaluate, print_summary
-    from vlagents_ray.evaluate.results.summary import failing_cells, summarize
-
     try:
         summary = evaluate(config, progress=progress, end_at=end_at)
     except PolicyFailed as error:
@@ -99,8 +155,6 @@ def require_results(config: EvalConfig, summary: Summary) -> None:
 
     The status is 1 if infrastructure lost an episode.
     """
-    from vlagents_ray.evaluate.results.summary import errors_of_policies, failing_cells
-
     wanted = {cell.fingerprint for cell in cells(config)}
     mine = [cell for cell in summary.results.cells if cell.cell in wanted]
     if failing := failing_cells(summary.results.among(mine)):
@@ -133,7 +187,7 @@ def watch_training(
     """Evaluate each step of the one policy whose checkpoint holds `{step}` once it is whole.
 
     All results go into one folder, and one server stays up. Policies without `{step}` are evaluated in the first round.
-    `live` is the address of the live page, as for `live_progress`. Ends as `rounds` does, or by Ctrl-C; resume to
+    `live` is the address of the live page, as for `shown_progress`. Ends as `rounds` does, or by Ctrl-C; resume to
     continue. An episode without a result ends the command with status 1, after the last round.
     """
     place, pattern = _watched(config)
@@ -172,7 +226,13 @@ def watch_training(
 
 def _watched(config: EvalConfig) -> tuple[int, str]:
     """Find the index of the policy that is trained, and the pattern of its checkpoints."""
-    found = {place: pattern for place, one in enumerate(config.policies) if (pattern := _pattern(one)) is not None}
+    found = {}
+    for place, policy in enumerate(config.policies):
+        settings: dict[str, Any] = {CHOICE: policy.checkpoint}
+        if policy.source is not None and "://" not in policy.source:
+            settings |= own_settings(policy_deployment(policy, policy.source, step_follows=True).applications[0])
+        if isinstance(pattern := settings[CHOICE], str) and STEP in pattern:
+            found[place] = pattern
     if len(found) != 1:
         raise ConfigError(
             f"--watch: got {STEP} in the checkpoints of {len(found)} policies, want it in that of one, such as "
@@ -184,14 +244,6 @@ def _watched(config: EvalConfig) -> tuple[int, str]:
     return place, pattern
 
 
-def _pattern(policy: PolicyConfig) -> str | None:
-    settings: dict[str, Any] = {CHOICE: policy.checkpoint}
-    if policy.source is not None and "://" not in policy.source:
-        settings |= own_settings(policy_deployment(policy, policy.source, step_follows=True).applications[0])
-    checkpoint = settings[CHOICE]
-    return checkpoint if isinstance(checkpoint, str) and STEP in checkpoint else None
-
-
 def _at(config: EvalConfig, place: int, steps: list[int]) -> EvalConfig:
     policies = list(config.policies)
     policies[place] = policies[place].model_copy(update={"steps": steps})
@@ -200,7 +252,6 @@ def _at(config: EvalConfig, place: int, steps: list[int]) -> EvalConfig:
 
 def run_on_robot(config: EvalConfig, address: str | None, *, operator: str, unblinded: bool) -> None:
     """Serve the policies that are not at a URL, play the trials, print the table."""
-    from vlagents_ray.evaluate import print_summary
     from vlagents_ray.evaluate.robot import PageOperator, TerminalOperator, evaluate_on_robot, planned_cells, unblind
 
     if unblinded:
@@ -228,9 +279,34 @@ def print_plan(config: EvalConfig) -> None:
     config, _ = resolve_policies(config, ask=False)
     results = Results.load(config.out) if (config.out / FILE).is_file() else None
     found = forecasts(cells(config), results)
-    out.print(_table(found))
-    for line in _sum(config, found):
-        out.print(line)
+    shown = Table(box=SIMPLE_HEAD, padding=0, pad_edge=False)
+    for title in ("policy", "env"):
+        shown.add_column(title, overflow="fold")
+    for title in ("seeds", "episodes", "finished", "to play", "s each", "time"):
+        shown.add_column(title, justify="right", no_wrap=True)
+    for one in found:
+        shown.add_row(
+            one.cell.contender,
+            " ".join(filter(None, one.cell.name[1:])),
+            str(len(one.cell.suite.seeds)),
+            str(one.cell.planned),
+            str(one.finished),
+            str(one.left),
+            "?" if one.seconds is None else f"{one.seconds:.3g}",
+            "?" if one.seconds is None else _time(one.left * one.seconds),
+        )
+    out.print(shown)
+    cases = [one.cell for one in found]
+    policies, envs = len({case.contender for case in cases}), len({(case.suite.name, case.env) for case in cases})
+    planned, finished = sum(case.planned for case in cases), sum(one.finished for one in found)
+    left = sum(one.left for one in found)
+    # Workers share one queue, so that at most one episode's time is lost at the end.
+    seconds = sum(one.left * (one.seconds or 0.0) for one in found) / max(1, min(config.workers, left))
+    unknown = sum(one.seconds is None for one in found)
+    beside = f", and {unknown} cells whose envs were not played yet" if unknown else ""
+    out.print(f"{len(found)} cells: {policies} policies at their checkpoints x {envs} environments of suites")
+    out.print(f"{planned} episodes, {finished} of them finished in {config.out}, {left} to play")
+    out.print(f"{_time(seconds)} with {config.workers} workers, as long as episodes before{beside}")
 
 
 def forecasts(planned: Sequence[EvalCase], results: Results | None) -> list[Forecast]:
@@ -248,42 +324,6 @@ def forecasts(planned: Sequence[EvalCase], results: Results | None) -> list[Fore
         mean = sum(seconds) / len(seconds) if seconds else None
         found.append(Forecast(cell, finished, 0 if has_stopped else cell.planned - finished, mean))
     return found
-
-
-def _table(found: list[Forecast]) -> Table:
-    shown = Table(box=SIMPLE_HEAD, padding=0, pad_edge=False)
-    for title in ("policy", "env"):
-        shown.add_column(title, overflow="fold")
-    for title in ("seeds", "episodes", "finished", "to play", "s each", "time"):
-        shown.add_column(title, justify="right", no_wrap=True)
-    for one in found:
-        shown.add_row(
-            one.cell.contender,
-            " ".join(filter(None, one.cell.name[1:])),
-            str(len(one.cell.suite.seeds)),
-            str(one.cell.planned),
-            str(one.finished),
-            str(one.left),
-            "?" if one.seconds is None else f"{one.seconds:.3g}",
-            "?" if one.seconds is None else _time(one.left * one.seconds),
-        )
-    return shown
-
-
-def _sum(config: EvalConfig, found: list[Forecast]) -> list[str]:
-    cases = [one.cell for one in found]
-    policies, envs = len({case.contender for case in cases}), len({(case.suite.name, case.env) for case in cases})
-    planned, finished = sum(case.planned for case in cases), sum(one.finished for one in found)
-    left = sum(one.left for one in found)
-    # Workers share one queue, so that at most one episode's time is lost at the end.
-    seconds = sum(one.left * (one.seconds or 0.0) for one in found) / max(1, min(config.workers, left))
-    unknown = sum(one.seconds is None for one in found)
-    beside = f", and {unknown} cells whose envs were not played yet" if unknown else ""
-    return [
-        f"{len(found)} cells: {policies} policies at their checkpoints x {envs} environments of suites",
-        f"{planned} episodes, {finished} of them finished in {config.out}, {left} to play",
-        f"{_time(seconds)} with {config.workers} workers, as long as episodes before{beside}",
-    ]
 
 
 def _time(seconds: float) -> str:

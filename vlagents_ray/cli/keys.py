@@ -13,7 +13,7 @@ from rich.text import Text
 from vlagents_ray.cli.console import err, errors, out, table
 from vlagents_ray.errors import ConfigError
 from vlagents_ray.serve.access.api_keys import FILE_VARIABLE
-from vlagents_ray.serve.access.key_store import Key, new_key, read_keys, revoke
+from vlagents_ray.serve.access.key_store import new_key, read_keys, revoke
 
 keys = typer.Typer(no_args_is_help=True, help="The API keys of a server: make, list and revoke them.")
 File = Annotated[
@@ -55,7 +55,12 @@ def list_(file: File = None) -> None:
         for key in read_keys(_existing(file)):
             limits = ("any" if value is None else f"{value:g}" for value in (key.rate, key.sessions))
             apps, scopes = ", ".join(key.apps) or "all", ", ".join(key.scopes)
-            listed.add_row(key.name, apps, *limits, key.rank or "any", scopes, _state(key))
+            state = Text("revoked", "red") if key.revoked else Text("valid", "green")
+            if key.expires is not None and not key.revoked:
+                date = time.strftime("%Y-%m-%d %H:%M UTC", time.gmtime(key.expires))
+                over = key.expires <= time.time()
+                state = Text(f"expired {date}", "red") if over else Text(f"until {date}", "green")
+            listed.add_row(key.name, apps, *limits, key.rank or "any", scopes, state)
         out.print(listed)
 
 
@@ -65,15 +70,6 @@ def revoke_(name: Name, file: File = None) -> None:
     with errors():
         revoke(_existing(file), name)
         out.print(f"key {name} revoked")
-
-
-def _state(key: Key) -> Text:
-    if key.revoked:
-        return Text("revoked", "red")
-    if key.expires is None:
-        return Text("valid", "green")
-    date = time.strftime("%Y-%m-%d %H:%M UTC", time.gmtime(key.expires))
-    return Text(f"until {date}", "green") if key.expires > time.time() else Text(f"expired {date}", "red")
 
 
 def _file(file: Path | None) -> Path:

@@ -6,16 +6,19 @@ import contextlib
 import math
 import os
 import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from functools import cache
 from typing import TYPE_CHECKING, Any
 
 from vlagents_ray.cli.listing import require_packages
 from vlagents_ray.cli.options import YAML_SUFFIXES
 from vlagents_ray.cli.ray_session import quiet_ray
+from vlagents_ray.client.agent import RemoteAgent
 from vlagents_ray.contract import require_match
 from vlagents_ray.envs.base import known_contract
 from vlagents_ray.errors import ConfigError, ContractMismatch
+from vlagents_ray.evaluate import EvalConfig, PolicyConfig, check, most_cpus, most_gpus
+from vlagents_ray.evaluate.plan.cases import cells
 from vlagents_ray.ray_tools.private import gpus_here
 from vlagents_ray.ray_tools.session import joined
 from vlagents_ray.serve.launch.deployment_file import (
@@ -31,8 +34,6 @@ from vlagents_ray.serve.models.checkpoints import STEP, resolved
 if TYPE_CHECKING:
     from ray.serve.schema import ServeDeploySchema
 
-    from vlagents_ray.evaluate import EvalConfig, PolicyConfig
-
 _STARTING_S = 30.0  # time limit for a server at a URL
 
 
@@ -43,8 +44,6 @@ def served(config: EvalConfig, address: str | None = None, *, replica_per_gpu: b
     Yields:
         The evaluation with the URLs of all its policies.
     """
-    from vlagents_ray.evaluate import check, most_cpus, most_gpus
-
     with contextlib.ExitStack() as stack:
         stack.enter_context(quiet_ray(None))
         if address is not None:
@@ -52,11 +51,22 @@ def served(config: EvalConfig, address: str | None = None, *, replica_per_gpu: b
         config, parts = resolve_policies(config)
         # Raise errors before anything starts.
         if address is None:
-            _require_gpus(config)
+            wanted = max(cell.worker.gpus for cell in cells(config))
+            if wanted and wanted > (here := gpus_here()):  # Ray would never start these workers here
+                raise ConfigError(
+                    f"worker.gpus: a worker wants {wanted:g} GPUs, this machine has {here:g}; want less (0 draws in "
+                    f"software), or the --address of a cluster that has them"
+                )
             for part in parts.values():
                 require_packages(part)
-        if config.real_robot is None:
-            _require_match(config, parts)
+        policy_contract = cache(lambda application: stated_contract(parts[application]))
+        for cell in cells(config) if config.real_robot is None else ():
+            application = str(cell.policy.url).removeprefix("serve://")
+            if application in parts and (env := known_contract(cell.env, cell.suite.env_options)) is not None:
+                try:
+                    require_match(policy_contract(application), env)
+                except ContractMismatch as error:
+                    raise ContractMismatch(f"{cell.policy.name!r} in {cell.env!r}: {error}") from None
         check(config)
         if parts and replica_per_gpu:
             parts = spread_over_gpus(parts, kept=config.workers * most_gpus(config))
@@ -65,32 +75,6 @@ def served(config: EvalConfig, address: str | None = None, *, replica_per_gpu: b
             cpus = max(os.cpu_count() or 1, math.ceil(config.workers * most_cpus(config)))
             stack.enter_context(running_server(together(parts), address=address, num_cpus=cpus, ingress=False))
         yield config
-
-
-def _require_gpus(config: EvalConfig) -> None:
-    """Raise `ConfigError` if workers need more GPUs than this machine has: Ray would never start them here."""
-    from vlagents_ray.evaluate.plan.cases import cells
-
-    wanted = max(cell.worker.gpus for cell in cells(config))
-    if wanted and wanted > (here := gpus_here()):
-        raise ConfigError(
-            f"worker.gpus: a worker wants {wanted:g} GPUs, this machine has {here:g}; want less (0 draws in software), "
-            f"or the --address of a cluster that has them"
-        )
-
-
-def _require_match(config: EvalConfig, parts: Mapping[str, ServeDeploySchema]) -> None:
-    """Raise `ContractMismatch` if a policy to be served does not fit an env, as far as both state their contracts."""
-    from vlagents_ray.evaluate.plan.cases import cells
-
-    policy_contract = cache(lambda application: stated_contract(parts[application]))
-    for cell in cells(config):
-        application = str(cell.policy.url).removeprefix("serve://")
-        if application in parts and (env := known_contract(cell.env, cell.suite.env_options)) is not None:
-            try:
-                require_match(policy_contract(application), env)
-            except ContractMismatch as error:
-                raise ContractMismatch(f"{cell.policy.name!r} in {cell.env!r}: {error}") from None
 
 
 def resolve_policies(config: EvalConfig, *, ask: bool = True) -> tuple[EvalConfig, dict[str, ServeDeploySchema]]:
@@ -108,7 +92,16 @@ def _resolve_policy(policy: PolicyConfig, parts: dict[str, ServeDeploySchema], *
     """Add name and URL to `policy`; add its deployment to `parts` unless a server has it."""
     url = policy.source if policy.source is not None and "://" in policy.source else policy.url
     if url is not None:
-        return policy.model_copy(update={"url": url, "source": None} | (_found(policy, url) if ask else {}))
+        found: dict[str, Any] = {"url": url, "source": None}
+        if ask:  # a result belongs to the served policy, not to an address
+            if policy.config:
+                names = sorted(policy.config)
+                raise ConfigError(f"policy {policy.name!r}: got {names}, but {url} has its settings already")
+            with RemoteAgent(url, connect_timeout_s=_STARTING_S) as agent:  # its server may be starting
+                said = agent.metadata
+            name = policy.name if "name" in policy.model_fields_set else said["policy"]
+            found |= {"name": name, "config": said.get("config", {}), "checkpoint": said.get("checkpoint")}
+        return policy.model_copy(update=found)
     if policy.source is None:
         raise ConfigError(f"policy {policy.name!r}: want `source`, a policy to serve, or the `url` of a server")
     part = policy_deployment(policy, policy.source, step_follows=bool(policy.steps))
@@ -127,20 +120,3 @@ def policy_deployment(policy: PolicyConfig, source: str, *, step_follows: bool =
     of_name = {"config": policy.config} if policy.config and not source.endswith(YAML_SUFFIXES) else None
     read = read_deployment(source, of_name, step_follows=step_follows)
     return with_settings(read, policy.config, steps=bool(policy.steps), step_follows=step_follows)
-
-
-def _found(policy: PolicyConfig, url: str) -> dict[str, Any]:
-    """Request the served policy: a result belongs to it, not to an address."""
-    if policy.config:
-        raise ConfigError(f"policy {policy.name!r}: got {sorted(policy.config)}, but {url} has its settings already")
-    said = _metadata(url)
-    name = policy.name if "name" in policy.model_fields_set else said["policy"]
-    return {"name": name, "config": said.get("config", {}), "checkpoint": said.get("checkpoint")}
-
-
-def _metadata(url: str) -> dict[str, Any]:
-    """Request the metadata of a server, which may be starting."""
-    from vlagents_ray import RemoteAgent
-
-    with RemoteAgent(url, connect_timeout_s=_STARTING_S) as agent:
-        return agent.metadata

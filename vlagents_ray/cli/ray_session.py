@@ -60,7 +60,11 @@ def quiet_ray(name: str | None, started: threading.Event | None = None) -> Itera
     Yields:
         The log file, which stays unless it is empty and which this user alone can read; None without one.
     """
-    file, kept = _file(name) if name is not None else (None, None)
+    file = kept = None
+    if name is not None:
+        descriptor, path = tempfile.mkstemp(prefix=f"{name}-", suffix=".log")
+        os.close(descriptor)
+        file, kept = Path(path), RotatingFileHandler(path, maxBytes=_FILE_BYTES, backupCount=1)
     terminal = _Terminal(kept, started)
     loggers = [logging.getLogger(one) for one in LOGGERS]
     for logger in loggers:
@@ -106,17 +110,15 @@ class _Terminal:
         """Print a line of another process, or keep it."""
         level = logging.INFO if _SERVES_INFO.match(line) else logging.WARNING
         text = f"({actor} pid={process}) {line}"
-        if self._is_load_failure(process, line) or not _is_problem(line, level):
-            self._note(text)
-        else:
-            sys.stderr.write(f"{text}\n")
-
-    def _is_load_failure(self, process: str, line: str) -> bool:
         if any(one in line for one in _LOAD_FAILURES):
             self.failing.add(process)
         elif _SERVES_LINE.match(line):
             self.failing.discard(process)
-        return self._started is not None and not self._started.is_set() and process in self.failing
+        starting = self._started is not None and not self._started.is_set()
+        if (starting and process in self.failing) or not _is_problem(line, level):
+            self._note(text)
+        else:
+            sys.stderr.write(f"{text}\n")
 
     def _note(self, text: str) -> None:
         if self._kept is not None:
@@ -171,12 +173,6 @@ class _LogFile:
 
 def _is_problem(text: str, level: int) -> bool:
     return level >= logging.WARNING and not any(one in text for one in _MEANT)
-
-
-def _file(name: str) -> tuple[Path, logging.Handler]:
-    descriptor, path = tempfile.mkstemp(prefix=f"{name}-", suffix=".log")
-    os.close(descriptor)
-    return Path(path), RotatingFileHandler(path, maxBytes=_FILE_BYTES, backupCount=1)
 
 
 @contextlib.contextmanager

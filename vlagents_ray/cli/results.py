@@ -33,7 +33,7 @@ def report_command(
 
     with errors():
         if live or live_at:
-            from vlagents_ray.cli.live import follow, live_address
+            from vlagents_ray.cli.evaluation import follow, live_address
 
             if len(folders) != 1 or html is not None:
                 raise ConfigError("--live shows one folder, and writes no file: want one OUT, and no --html")
@@ -182,34 +182,32 @@ def replay_command(
             from vlagents_ray.open_loop.replay import ReplayPlan
 
             chosen = None if episodes is None else parse_episodes(episodes)
-            names = Names(_renamed(cameras), None if state is None else parse_list(state))
+            pairs = [part.partition("=") for part in parse_list(cameras or "")]
+            if odd := [name for name, equals, _ in pairs if not equals]:
+                raise ConfigError(f"--cameras: got {odd[0]!r}, want POLICY=DATASET, such as base=top,wrist=wrist_left")
+            renamed = {name: camera for name, _, camera in pairs}
+            names = Names(renamed, None if state is None else parse_list(state))
             plan = ReplayPlan(chosen, horizon, every, at_once, names)
             replay_dataset(folder, policy, out_dir or fresh(Path("runs/replay")), plan)
             return
         if episode is None:
             raise ConfigError(f"{folder}: holds results, and wants an episode: its key, or ENV#NUMBER")
-        same = _same(folder, episode, policy, out_dir, address)
-    raise typer.Exit(not same)
+        from vlagents_ray.cli.evaluation import play_one
+        from vlagents_ray.evaluate import Results
+        from vlagents_ray.evaluate.replay import compare, find
 
-
-def _same(folder: Path, episode: str, policy: str | None, out_dir: Path | None, address: str | None) -> bool:
-    """Play an episode again, print the differences, and return whether there are none."""
-    from vlagents_ray.cli.evaluation import play_one
-    from vlagents_ray.evaluate import Results
-    from vlagents_ray.evaluate.replay import compare, find
-
-    recorded = find(Results.load(folder), episode)
-    other: dict[str, Any] | None = None
-    if policy is not None:
-        other = {"source": policy, "url": None, "config": {}, "checkpoint": None}
-    into = out_dir or fresh(folder / "replays" / "replay")
-    summary = play_one(recorded.config(into, policy=other), address, recorded.number_and_seed)
-    found = compare(recorded, summary.results)
-    steps = recorded.episode.result.steps
-    lines = found or [f"the same: {steps} actions byte for byte, and what came of them"]
-    for line in [*lines, f"replay: {into}"]:
-        out.print(line)
-    return not found
+        recorded = find(Results.load(folder), episode)
+        other: dict[str, Any] | None = (
+            None if policy is None else {"source": policy, "url": None, "config": {}, "checkpoint": None}
+        )
+        into = out_dir or fresh(folder / "replays" / "replay")
+        summary = play_one(recorded.config(into, policy=other), address, recorded.number_and_seed)
+        found = compare(recorded, summary.results)
+        steps = recorded.episode.result.steps
+        lines = found or [f"the same: {steps} actions byte for byte, and what came of them"]
+        for line in [*lines, f"replay: {into}"]:
+            out.print(line)
+    raise typer.Exit(bool(found))
 
 
 def replay_dataset(folder: Path, policy: str, into: Path, plan: ReplayPlan) -> None:
@@ -237,10 +235,3 @@ def parse_episodes(text: str) -> Sequence[int]:
             raise ConfigError(f"--episodes: got {part!r}, want numbers and ranges, such as 0-9,12")
         found += range(int(first), int(last or first) + 1)
     return found
-
-
-def _renamed(text: str | None) -> dict[str, str]:
-    pairs = [part.partition("=") for part in parse_list(text or "")]
-    if odd := [name for name, equals, _ in pairs if not equals]:
-        raise ConfigError(f"--cameras: got {odd[0]!r}, want POLICY=DATASET, such as base=top,wrist=wrist_left")
-    return {name: camera for name, _, camera in pairs}

@@ -9,7 +9,6 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
-from urllib.parse import urlsplit
 
 import typer
 
@@ -23,7 +22,6 @@ from vlagents_ray.serve.ports import EVERYWHERE, LOOPBACK
 if TYPE_CHECKING:
     from ray.serve.schema import ServeDeploySchema
 
-    from vlagents_ray.serve.config.deployment import ServerArgs
     from vlagents_ray.serve.launch.haproxy import Tls
 
 
@@ -130,27 +128,17 @@ def connection_lines(
         args = ServerArgs(**app.args)
         settings = ", ".join(f"{name}={value!r}" for name, value in own_settings(app).items())
         yield f"  policy: {args.policy}" + (f" ({settings})" if settings else "")
-        keyed = not insecure and (keys is not None or _wants_key(args))
+        keyed = not insecure
+        if keyed and keys is None:
+            with contextlib.suppress(ConfigError):  # the keys are on the cluster's machines
+                keyed = args.access.keys() is not None
         curl = 'curl -H "Authorization: Bearer $VLAGENTS_RAY_API_KEY" ' if keyed else ""
         yield f"  how to talk to it: {curl}{url}/docs"
         if not (insecure or args.access.insecure):  # --insecure shows no live page
             yield f"  what it does now: {url}/live"
         for name, one in args.dialects.describe().items():
-            places = [one["address"]] if "address" in one else [_address(url, path) for path in one["paths"]]
+            places = [one["address"]] if "address" in one else []
+            for path in () if places else one["paths"]:  # such as "WS /openpi"
+                method, _, place = path.partition(" ")
+                places.append(f"ws{url.removeprefix('http')}{place}" if method == "WS" else f"{method} {url}{place}")
             yield f"  {name}: {', '.join(places)}"
-
-
-def _wants_key(args: ServerArgs) -> bool:
-    try:
-        return args.access.keys() is not None
-    except ConfigError:  # the keys are on the cluster's machines
-        return True
-
-
-def _address(url: str, path: str) -> str:
-    """Turn "WS /openpi" into a URL."""
-    method, _, place = path.partition(" ")
-    if method != "WS":
-        return f"{method} {url}{place}"
-    parts = urlsplit(url)
-    return f"{'wss' if parts.scheme == 'https' else 'ws'}://{parts.netloc}{parts.path}{place}"

@@ -44,13 +44,21 @@ def eval_(
     Existing results are continued, so the same command after `scancel` or a failure finishes the rest. Without
     --workers there is one for each CPU but one, and a policy has a replica on each GPU.
     """
+    from vlagents_ray.evaluate import most_cpus, most_gpus
+
     with errors():
         words, options = split(context.args, _options(evaluate_command))
         index = first_index(options.get("array") or "0")
         config, other = (_evaluation([word.replace(_TASK, one) for word in words]) for one in (index, f"{index}0"))
         if "array" in options and config.out == other.out:
             raise ConfigError(f"--array: its tasks write to one folder; want {_TASK} in it, as in --out runs/x/{_TASK}")
-        fill = [] if "workers" in config.model_fields_set else [f"--fill={_cpus(config):g}"]
+        fill = []
+        if "workers" not in config.model_fields_set:  # they fill the job; how many GPUs policies need is not known
+            if most_gpus(config):
+                raise ConfigError(
+                    "workers have GPUs, but their number is not said; want --workers: policies get the GPUs left over"
+                )
+            fill = [f"--fill={max(1.0, most_cpus(config)):g}"]
         folder = Path(os.path.commonpath([config.out, other.out])) / "slurm"  # of an array: above its tasks
         arguments = ["eval", *fill, f"--closing={closing:g}", "--", *words]
         _submit(Script("eval", folder, arguments, options, resubmit, setup), print_only, parsable)
@@ -130,20 +138,6 @@ def _refuse(given: dict[str, Any], why: str, *names: str) -> None:
     said = [f"--{name.replace('_', '-')}" for name in names if given[name]]
     if said:
         raise ConfigError(f"{', '.join(said)}: not for a job: {why}; leave it out")
-
-
-def _cpus(config: EvalConfig) -> float:
-    """Return the CPUs of the job for each worker, at least one, if workers fill the job.
-
-    Raises `ConfigError` if GPUs limit the number of workers, since the GPUs for policies are not known.
-    """
-    from vlagents_ray.evaluate import most_cpus, most_gpus
-
-    if most_gpus(config):
-        raise ConfigError(
-            "workers have GPUs, but their number is not said; want --workers: policies get the GPUs left over"
-        )
-    return max(1.0, most_cpus(config))
 
 
 def _evaluation(words: list[str]) -> EvalConfig:

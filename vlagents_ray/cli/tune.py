@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Mapping
 from enum import Enum
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 import yaml
@@ -16,7 +15,7 @@ from vlagents_ray.cli.options import YAML_SUFFIXES, StateDims, parse_dims, parse
 from vlagents_ray.errors import ConfigError
 
 if TYPE_CHECKING:
-    from vlagents_ray.bench.tuning_choice import MeasuredPoint
+    from vlagents_ray.bench.tuner import MeasuredPoint
 
 
 class Wanted(str, Enum):
@@ -44,8 +43,7 @@ def tune_command(
 ) -> None:
     """Find the best batch size, compilation and precision by measuring, and print the settings to change."""
     began = time.monotonic()
-    from vlagents_ray.bench.tuner import TunePlan, Tuner
-    from vlagents_ray.bench.tuning_choice import TuningGoal, choose, chosen_settings, default_point, figures
+    from vlagents_ray.bench.tuner import TunePlan, Tuner, TuningGoal, choose, chosen_settings, default_point, figures
     from vlagents_ray.serve.config.deployment import ServerArgs
     from vlagents_ray.serve.launch.deployment_file import policy_application
 
@@ -70,24 +68,19 @@ def tune_command(
         for sentence in tuner.left_out:
             out.print(f"left out: {sentence}", style="yellow")
         chosen, default = choose(points, goal), default_point(points, goal, args.batch.max_size)
-        settings = chosen_settings(chosen, args.batch, tuner.fixed)
-        _show_choice(_words(chosen), _words(default), began, f"below args of {application.name!r} in {file}", settings)
+        out.print(f"chosen: {_words(chosen)}\nthe file as it is: {_words(default)}")
+        out.print(f"after {time.monotonic() - began:.0f} s")
+        if settings := chosen_settings(chosen, args.batch, tuner.fixed):
+            text = yaml.safe_dump(settings, sort_keys=False, default_flow_style=None)
+            out.print(f"set below args of {application.name!r} in {file}:\n\n{text}")
+        else:
+            out.print("nothing to change")
 
 
 def _words(point: MeasuredPoint | None) -> str:
     if point is None:
         return "not measured, or out of the goal"
-    from vlagents_ray.bench.tuning_choice import sessions
+    from vlagents_ray.bench.tuner import sessions
 
     figures = f"{point.actions_per_s:.1f} actions/s, p99 {point.p99_ms:.1f} ms"
     return f"{point.variant.name}, {sessions(point.sessions)}: {figures}"
-
-
-def _show_choice(chosen: str, own: str, began: float, where: str, settings: Mapping[str, Any]) -> None:
-    """Print the choice beside the figures of the unchanged file, and the settings to change as YAML."""
-    out.print(f"chosen: {chosen}\nthe file as it is: {own}\nafter {time.monotonic() - began:.0f} s")
-    if not settings:
-        out.print("nothing to change")
-        return
-    text = yaml.safe_dump(dict(settings), sort_keys=False, default_flow_style=None)
-    out.print(f"set {where}:\n\n{text}")

@@ -12,7 +12,7 @@ from __future__ import annotations
 import importlib
 from typing import TYPE_CHECKING, Any
 
-from vlagents_ray.evaluate.artifacts.trajectory import Trajectory
+from vlagents_ray.evaluate.artifacts.recorder import Trajectory
 from vlagents_ray.evaluate.plan.config import (
     ClockConfig,
     EvalConfig,
@@ -23,19 +23,24 @@ from vlagents_ray.evaluate.plan.config import (
 )
 from vlagents_ray.evaluate.results.comparison import Comparison, compare
 from vlagents_ray.evaluate.results.reader import Results, synchronous_twin
-from vlagents_ray.evaluate.results.statistics import Pairs, Rate, difference_interval, holm, mcnemar, wilson
-from vlagents_ray.evaluate.results.stopping import confidence_sequence
+from vlagents_ray.evaluate.results.statistics import (
+    Pairs,
+    Rate,
+    confidence_sequence,
+    difference_interval,
+    holm,
+    mcnemar,
+    wilson,
+)
 from vlagents_ray.evaluate.results.summary import Group, Summary
 
 if TYPE_CHECKING:
-    from vlagents_ray.evaluate.report.progress import Progress, progress_for
-    from vlagents_ray.evaluate.report.terminal import print_summary, results_table
+    from vlagents_ray.evaluate.report.terminal import Progress, print_summary, progress_for, results_table
     from vlagents_ray.evaluate.run import EvaluationInterrupted, OutOfTime, check, evaluate
     from vlagents_ray.evaluate.workers.cluster import most_cpus, most_gpus
 
 _LATE = {
-    "report.progress": ("Progress", "progress_for"),
-    "report.terminal": ("print_summary", "results_table"),
+    "report.terminal": ("Progress", "print_summary", "progress_for", "results_table"),
     "run": ("EvaluationInterrupted", "OutOfTime", "check", "evaluate"),
     "workers.cluster": ("most_cpus", "most_gpus"),
 }  # module: its names

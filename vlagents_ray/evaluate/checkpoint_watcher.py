@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import re
 import time
@@ -17,14 +18,6 @@ FINISHED = "training_finished"  # a file of this name in the folder means that n
 PADDED = 6  # digits to which a step may be padded with zeros, as `find_checkpoint` accepts it
 
 Snapshot = frozenset[tuple[str, int, int]]  # (path, size in bytes, time of change in ns) of each file
-
-
-@dataclass(frozen=True, slots=True)
-class _FoundCheckpoint:
-    """A checkpoint in the folder."""
-
-    entry: Path  # in the folder itself
-    checkpoint: Path  # the path that the policy loads: the entry, or one in it
 
 
 @dataclass(slots=True)
@@ -87,34 +80,34 @@ class CheckpointWatcher:
         """Return the steps that are not complete, each with the reason."""
         return {step: seen.why for step, seen in sorted(self._seen.items())}
 
-    def _found(self) -> dict[int, _FoundCheckpoint]:
-        found: dict[int, _FoundCheckpoint] = {}
+    def _found(self) -> dict[int, tuple[Path, Path]]:
+        """Return by step the entry of the folder, and the path that the policy loads: the entry, or one in it."""
+        found: dict[int, tuple[Path, Path]] = {}
         for entry in self.folder.iterdir() if self.folder.is_dir() else ():
             match = self._name.fullmatch(entry.name)
             step = int(match[1]) if match else -1
             if match is None or match[1] not in (str(step), f"{step:0{PADDED}d}"):
                 continue
             if step not in found or match[1] == str(step):  # the policy looks for this name first
-                found[step] = _FoundCheckpoint(
-                    entry, entry.joinpath(*(at_step(part, match[1]) for part in self._below))
-                )
+                found[step] = entry, entry.joinpath(*(at_step(part, match[1]) for part in self._below))
         return found
 
-    def _is_complete(self, step: int, found: _FoundCheckpoint, now: float) -> bool:
-        snapshot = _snapshot(found.entry)
+    def _is_complete(self, step: int, found: tuple[Path, Path], now: float) -> bool:
+        entry, checkpoint = found
+        snapshot = _snapshot(entry)
         seen = self._seen.get(step)
         if seen is None or seen.snapshot != snapshot:
             seen = self._seen[step] = _SeenFile(snapshot, now)
         if seen.examined:
             return False
         if self._marker is not None:
-            seen.why = "" if (found.entry / self._marker).exists() else f"has no {self._marker}"
+            seen.why = "" if (entry / self._marker).exists() else f"has no {self._marker}"
         else:
             seen.why = "" if now - seen.since >= self._settle_s else "is too new, or changes"
         if seen.why:
             return False
-        seen.why, seen.examined = unfinished(found.checkpoint) or "", True
-        return not seen.why and _snapshot(found.entry) == snapshot  # it passed, and has not changed since
+        seen.why, seen.examined = unfinished(checkpoint) or "", True
+        return not seen.why and _snapshot(entry) == snapshot  # it passed, and has not changed since
 
 
 def rounds(
@@ -140,15 +133,10 @@ def rounds(
 
 
 def _snapshot(entry: Path) -> Snapshot:
-    if not entry.is_dir():
-        return frozenset(_line(entry))
     names = [Path(folder, name) for folder, _, files in os.walk(entry) for name in files]
-    return frozenset(line for path in names for line in _line(path))
-
-
-def _line(path: Path) -> Iterator[tuple[str, int, int]]:
-    try:
-        found = path.stat()
-    except FileNotFoundError:  # it has been renamed
-        return
-    yield str(path), found.st_size, found.st_mtime_ns
+    found = set()
+    for path in names if entry.is_dir() else [entry]:
+        with contextlib.suppress(FileNotFoundError):  # it has been renamed
+            state = path.stat()
+            found.add((str(path), state.st_size, state.st_mtime_ns))
+    return frozenset(found)

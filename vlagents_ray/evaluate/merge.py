@@ -30,7 +30,7 @@ from vlagents_ray.evaluate.report.page import write_report
 from vlagents_ray.evaluate.results.changes import Change, changed, listed, policy_changes, program_changes
 from vlagents_ray.evaluate.results.database import FILE, SCHEMA, VERSION, insert
 from vlagents_ray.evaluate.results.reader import CellResults, Results, Run, Worker, episode_of, reading, table
-from vlagents_ray.evaluate.results.summary import Summary, checkpoint_of, summarize, weights_of, write_summary
+from vlagents_ray.evaluate.results.summary import Summary, stated, summarize, write_summary
 
 _SHOWN = 10  # conflicts in a message
 Row = dict[str, Any]
@@ -96,8 +96,19 @@ def merge(out: Path, folders: Sequence[Path], *, keep_first: bool = False, accep
         )
     with storing(out):
         _link_files(merged, out, folders)
-        with whole(out / FILE) as part:
-            _write(merged, part)
+        tables = {
+            "runs": merged.runs,
+            "policies": list(merged.policies.values()),
+            "cells": list(merged.cells.values()),
+            "episodes": list(merged.episodes.values()),
+            "attempts": merged.attempts,
+            "workers": merged.workers,
+        }
+        with whole(out / FILE) as part, closing(sqlite3.connect(part)) as db:
+            db.executescript(f"BEGIN; {SCHEMA} PRAGMA user_version = {VERSION}; COMMIT;")
+            with db:
+                for name, row in ((name, row) for name, rows in tables.items() for row in rows):
+                    insert(db, name, row)
         summary = summarize(Results.load(out))
         write_summary(summary)
     write_report(summary.results, out / REPORT)
@@ -175,14 +186,12 @@ def _add_episodes(merged: _Merged, folder: Path, db: sqlite3.Connection) -> list
         known = merged.episodes.get(row["key"])
         if known is None or (known["status"] == "infra_failed" and row["status"] != "infra_failed"):
             merged.episodes[row["key"]], merged.home[row["key"]] = row, folder
-        elif row["status"] != "infra_failed" and (odd := _differences(known, row)):
-            conflicts.append(f"{row['key']}: {odd} in {merged.home[row['key']]} and {folder}")
+        elif row["status"] != "infra_failed":
+            before, now = (episode_of(dict(one)).result.outcome for one in (known, row))
+            odd = [f"{name} is {before[name]!r} and {now[name]!r}" for name in before if before[name] != now[name]]
+            if odd:
+                conflicts.append(f"{row['key']}: {', '.join(odd)} in {merged.home[row['key']]} and {folder}")
     return conflicts
-
-
-def _differences(known: Row, row: Row) -> str:
-    before, now = episode_of(dict(known)).result.outcome, episode_of(dict(row)).result.outcome
-    return ", ".join(f"{name} is {before[name]!r} and {now[name]!r}" for name in before if before[name] != now[name])
 
 
 def _require_one_checkpoint(merged: _Merged, *, weights_may_differ: bool) -> None:
@@ -225,23 +234,6 @@ def _link_files(merged: _Merged, out: Path, folders: Sequence[Path]) -> None:
         link_or_copy(source, target)
 
 
-def _write(merged: _Merged, path: Path) -> None:
-    tables = {
-        "runs": merged.runs,
-        "policies": list(merged.policies.values()),
-        "cells": list(merged.cells.values()),
-        "episodes": list(merged.episodes.values()),
-        "attempts": merged.attempts,
-        "workers": merged.workers,
-    }
-    with closing(sqlite3.connect(path)) as db:
-        db.executescript(f"BEGIN; {SCHEMA} PRAGMA user_version = {VERSION}; COMMIT;")
-        with db:
-            for name, rows in tables.items():
-                for row in rows:
-                    insert(db, name, row)
-
-
 def combined(folders: Sequence[Results]) -> Results:
     """Combine the results of several folders.
 
@@ -255,32 +247,6 @@ def combined(folders: Sequence[Results]) -> Results:
         raise ConfigError("report: got no folder, want one or more that evaluations wrote their results to")
     if len(folders) == 1:
         return folders[0]
-    _require_apart(folders)
-    every = [cell for each in folders for cell in each.cells]
-    counts = Counter((cell.contender, cell.suite, cell.env) for cell in every)
-    clashing = {cell.policy for cell in every if counts[cell.contender, cell.suite, cell.env] > 1}
-    clashing |= _of_other_weights(folders)
-    base = Path(os.path.commonpath([each.out.resolve() for each in folders]))
-    cells: list[CellResults] = []
-    runs: list[Run] = []
-    policies: dict[str, dict[str, Any]] = {}
-    workers: list[Worker] = []
-    for each, label in zip(folders, _labels(folders, base), strict=True):
-        names = {
-            cell.policy: f"{cell.policy} ({label})" if cell.policy in clashing else cell.policy for cell in each.cells
-        }
-        prefix = each.out.resolve().relative_to(base)
-        cells += [_moved(cell, names[cell.policy], prefix, len(runs)) for cell in each.cells]
-        policies |= {names.get(name, name): said for name, said in each.policies.items()}
-        workers += [
-            replace(one, policy=names.get(one.policy, one.policy), run=one.run + len(runs)) for one in each.workers
-        ]
-        runs += [replace(run, run=run.run + len(runs)) for run in each.runs]
-    parts = tuple(sorted((each.out.resolve() for each in folders), reverse=True))  # subfolders before their parents
-    return Results(base, tuple(cells), tuple(runs), policies, tuple(workers), parts)
-
-
-def _require_apart(folders: Sequence[Results]) -> None:
     seen: dict[str, Path] = {}
     for each in folders:
         for cell in each.cells:
@@ -290,31 +256,39 @@ def _require_apart(folders: Sequence[Results]) -> None:
                     f"settings; put parts of one evaluation into one folder first: `vlagents-ray merge OUT {first} "
                     f"{each.out}`, with --accept-changes if code or weights changed between them"
                 )
-
-
-def _of_other_weights(folders: Sequence[Results]) -> set[str]:
-    """Return the policies with several weights under one checkpoint's name."""
-    first: dict[tuple[str, str | None], str] = {}  # by policy id and checkpoint
-    found = set()
-    for cell in (cell for each in folders for cell in each.cells):
-        weights = weights_of(cell)
-        if weights is not None and first.setdefault((cell.contender, checkpoint_of(cell)), weights) != weights:
-            found.add(cell.policy)
-    return found
-
-
-def _labels(folders: Sequence[Results], base: Path) -> list[str]:
-    """Return names of the folders: their last parts, or their paths under `base` if last parts are the same."""
-    names = [each.out.resolve().name for each in folders]
-    if len(set(names)) == len(names):
-        return names
-    return [str(each.out.resolve().relative_to(base)) for each in folders]
-
-
-def _moved(cell: CellResults, policy: str, prefix: Path, runs_before: int) -> CellResults:
-    episodes = tuple(
-        replace(one, run=one.run + runs_before, videos=tuple(str(prefix / video) for video in one.videos))
-        for one in cell.episodes
-    )
-    attempts = tuple(replace(one, run=one.run + runs_before) for one in cell.attempts)
-    return replace(cell, policy=policy, episodes=episodes, attempts=attempts)
+    every = [cell for each in folders for cell in each.cells]
+    counts = Counter((cell.contender, cell.suite, cell.env) for cell in every)
+    clashing = {cell.policy for cell in every if counts[cell.contender, cell.suite, cell.env] > 1}
+    known: dict[tuple[str, str | None], str] = {}  # the weights by policy id and checkpoint
+    for cell in every:
+        weights, checkpoint = stated(cell, "weights"), stated(cell, "checkpoint")
+        if weights is not None and known.setdefault((cell.contender, checkpoint), weights) != weights:
+            clashing.add(cell.policy)
+    base = Path(os.path.commonpath([each.out.resolve() for each in folders]))
+    cells: list[CellResults] = []
+    runs: list[Run] = []
+    policies: dict[str, dict[str, Any]] = {}
+    workers: list[Worker] = []
+    # The folders' last parts or, if some are the same, their paths under `base`.
+    labels = [each.out.resolve().name for each in folders]
+    if len(set(labels)) < len(labels):
+        labels = [str(each.out.resolve().relative_to(base)) for each in folders]
+    for each, label in zip(folders, labels, strict=True):
+        names = {
+            cell.policy: f"{cell.policy} ({label})" if cell.policy in clashing else cell.policy for cell in each.cells
+        }
+        prefix = each.out.resolve().relative_to(base)
+        for cell in each.cells:
+            episodes = tuple(
+                replace(one, run=one.run + len(runs), videos=tuple(str(prefix / video) for video in one.videos))
+                for one in cell.episodes
+            )
+            attempts = tuple(replace(one, run=one.run + len(runs)) for one in cell.attempts)
+            cells.append(replace(cell, policy=names[cell.policy], episodes=episodes, attempts=attempts))
+        policies |= {names.get(name, name): said for name, said in each.policies.items()}
+        workers += [
+            replace(one, policy=names.get(one.policy, one.policy), run=one.run + len(runs)) for one in each.workers
+        ]
+        runs += [replace(run, run=run.run + len(runs)) for run in each.runs]
+    parts = tuple(sorted((each.out.resolve() for each in folders), reverse=True))  # subfolders before their parents
+    return Results(base, tuple(cells), tuple(runs), policies, tuple(workers), parts)

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from vlagents_ray.errors import ConfigError
-from vlagents_ray.evaluate.artifacts.trajectory import Trajectory
+from vlagents_ray.evaluate.artifacts.recorder import Trajectory
 from vlagents_ray.evaluate.plan.cases import cells
 from vlagents_ray.evaluate.plan.config import EvalConfig
 from vlagents_ray.evaluate.results.reader import CellResults, Episode, Results

@@ -8,6 +8,7 @@ import threading
 import time
 from collections import Counter
 from collections.abc import Callable, Iterable
+from dataclasses import dataclass
 from typing import Any
 
 from vlagents_ray.errors import ConfigError, StorageFailed, VLAgentsError, from_code
@@ -20,16 +21,15 @@ from vlagents_ray.evaluate.plan.config import EvalConfig
 from vlagents_ray.evaluate.plan.jobs import EpisodeKey, Job, JobQueue, plan
 from vlagents_ray.evaluate.report.page import FILE as REPORT
 from vlagents_ray.evaluate.report.page import write_report
-from vlagents_ray.evaluate.report.progress import Progress
+from vlagents_ray.evaluate.report.terminal import Progress
 from vlagents_ray.evaluate.results.reader import Results, rate_of
-from vlagents_ray.evaluate.results.stopping import Stopping
+from vlagents_ray.evaluate.results.statistics import Stopping
 from vlagents_ray.evaluate.results.store import Store
 from vlagents_ray.evaluate.results.summary import Summary, summarize, write_summary
 from vlagents_ray.evaluate.trackers import TrackerFeed
 from vlagents_ray.evaluate.workers.cluster import ray_cluster, unused_gpus
-from vlagents_ray.evaluate.workers.pool import WorkerPool
+from vlagents_ray.evaluate.workers.pool import FailedAttempts, InProcessWorkers, WorkerPool, Workers, dispatch
 from vlagents_ray.evaluate.workers.rollout import AgentFactory, Report, agents, factory_program
-from vlagents_ray.evaluate.workers.worker import FailedAttempts, InProcessWorkers, Workers, dispatch
 from vlagents_ray.interface import Agent
 from vlagents_ray.ray_tools.signals import stop_signals
 
@@ -141,28 +141,23 @@ def check(config: EvalConfig) -> None:
         Store(config).close()
 
 
+@dataclass(eq=False)
 class _Run:
     """The driver's side of one run."""
 
-    def __init__(
-        self,
-        config: EvalConfig,
-        store: Store,
-        progress: Progress,
-        tracking: TrackerFeed,
-        only: tuple[int, int] | None,
-        end_at: float | None,
-        in_process: bool,
-        local_program: dict[str, Any],
-    ) -> None:
-        self._config = config
-        self._store = store
-        self._progress = progress
-        self._tracking = tracking
-        self._local_program = local_program
+    config: EvalConfig
+    store: Store
+    progress: Progress
+    tracking: TrackerFeed
+    only: tuple[int, int] | None
+    end_at: float | None
+    in_process: bool
+    local_program: dict[str, Any]
+
+    def __post_init__(self) -> None:
+        config, store = self.config, self.store
         self._attempts = FailedAttempts(config)
-        self._in_process = in_process
-        self._checked_gpus = in_process  # when an env first drew
+        self._checked_gpus = self.in_process  # when an env first drew
         earlier = {cell.cell: cell for cell in Results.load(config.out).cells}
         self._recorded = {cell: rate_of([results], "success_once") for cell, results in earlier.items()}
         self._stopping: dict[str, Stopping] = {}
@@ -172,12 +167,12 @@ class _Run:
                 stopping.add_all(episode.result for episode in earlier[cell.fingerprint].episodes)
                 self._stopping[cell.fingerprint] = stopping
         finished = store.finished()
-        wanted = [job for job in plan(store.cells) if only in (None, (job.key.episode, job.key.seed))]
+        wanted = [job for job in plan(store.cells) if self.only in (None, (job.key.episode, job.key.seed))]
         pending = [job for job in wanted if str(job.key) not in finished and not self._has_stopped(job)]
         self._queue = JobQueue(pending)
         self._left = Counter(job.key.settings for job in pending)  # by cell
         played = (one.result.seconds for cell in earlier.values() for one in cell.episodes)
-        self._deadline = Deadline(end_at, played)
+        self._deadline = Deadline(self.end_at, played)
 
     def play(self, factory: AgentFactory) -> tuple[str, Summary]:
         """Play all queued episodes, until a signal or the deadline ends the run; returns its state and summary.
@@ -186,11 +181,11 @@ class _Run:
         killed seconds later.
         """
         if not len(self._queue):
-            return "complete", conclude(self._config, self._store, "complete")
-        with contextlib.nullcontext() if self._in_process else ray_cluster(self._config), stop_signals() as stop:
-            self._progress.begin(self._store.cells, self._recorded, len(self._queue))
+            return "complete", conclude(self.config, self.store, "complete")
+        with contextlib.nullcontext() if self.in_process else ray_cluster(self.config), stop_signals() as stop:
+            self.progress.begin(self.store.cells, self._recorded, len(self._queue))
             try:
-                with (InProcessWorkers if self._in_process else WorkerPool)(self._config, factory) as pool:
+                with (InProcessWorkers if self.in_process else WorkerPool)(self.config, factory) as pool:
                     try:
                         while not stop.is_set() and not self._deadline.is_over:
                             if not pool.busy and not (len(self._queue) and self._deadline.leaves_room):
@@ -205,9 +200,9 @@ class _Run:
                         pool.close()
                     if stop.is_set():
                         state = EvaluationInterrupted.why
-                    return state, conclude(self._config, self._store, state)
+                    return state, conclude(self.config, self.store, state)
             finally:
-                self._progress.end()
+                self.progress.end()
 
     def _poll_pool(self, pool: Workers, stop: threading.Event) -> None:
         if self._deadline.leaves_room:
@@ -220,18 +215,18 @@ class _Run:
                 if stop.wait(late_s):
                     continue
                 late_s = 0.0  # one wait is for all failures of a poll: a lost policy fails many episodes at once
-            with storing(self._config.out):
+            with storing(self.config.out):
                 self._handle(job, report)
 
     def _handle(self, job: Job, report: Report) -> None:
         if report.policy is not None:
-            self._store.note_policy(job.cell.policy.name, self._local_program | report.policy)
-            save_diffs(self._config.out, [policy_code(report.policy)])
+            self.store.note_policy(job.cell.policy.name, self.local_program | report.policy)
+            save_diffs(self.config.out, [policy_code(report.policy)])
         if report.env is not None:
-            self._store.note_env(job.cell.place, report.env)
-            save_diffs(self._config.out, [report.env.code])
+            self.store.note_env(job.cell.place, report.env)
+            save_diffs(self.config.out, [report.env.code])
         if report.worker is not None:
-            self._store.note_worker(report.worker)
+            self.store.note_worker(report.worker)
             if report.worker.renderer is not None and not self._checked_gpus:
                 self._checked_gpus = True
                 if (hint := unused_gpus(job.cell, report.worker)) is not None:
@@ -255,12 +250,12 @@ class _Run:
     def _failed(self, job: Job, failure: Failure) -> None:
         beyond = self._has_stopped(job)  # it is no longer needed
         retried = self._attempts.repeats(job, failure) and not beyond
-        self._store.record_attempt(job, failure, retried=retried)
+        self.store.record_attempt(job, failure, retried=retried)
         if failure.cause == "user":
             raise from_code(failure.code, failure.message)
         if retried:
             self._queue.put_back(job.again())
-            self._progress.retry(job, failure)
+            self.progress.retry(job, failure)
             return
         if beyond:
             return
@@ -270,28 +265,23 @@ class _Run:
 
     def _record(self, job: Job, result: EpisodeResult, kept: Artifacts) -> None:
         # Files first: a crash in between repeats the episode, and they are overwritten.
-        videos, trajectory = save(self._config.out, job.cell, result, kept)
-        self._store.record(result, job.attempt, videos, trajectory)
-        self._progress.episode(job.cell, result)
+        videos, trajectory = save(self.config.out, job.cell, result, kept)
+        self.store.record(result, job.attempt, videos, trajectory)
+        self.progress.episode(job.cell, result)
         self._left[job.key.settings] -= 1
-        self._stop_if_certain(job, result)
+        stopping = self._stopping.get(job.cell.fingerprint)
+        if stopping is not None and not self._has_stopped(job):
+            stopping.add(result)
+            if stopping.at is not None:  # its outcomes suffice; running episodes are finished
+                dropped = self._queue.drop(job.cell.fingerprint)
+                self._left[job.key.settings] -= dropped
+                self.progress.stopped(job.cell, stopping.at, dropped)
         if not self._left[job.key.settings]:
-            self._tracking.update()
+            self.tracking.update()
 
     def _has_stopped(self, job: Job) -> bool:
         stopping = self._stopping.get(job.cell.fingerprint)
         return stopping is not None and stopping.at is not None
-
-    def _stop_if_certain(self, job: Job, result: EpisodeResult) -> None:
-        """Drop the waiting episodes of the cell once its outcomes suffice; running episodes are finished."""
-        stopping = self._stopping.get(job.cell.fingerprint)
-        if stopping is None or self._has_stopped(job):
-            return
-        stopping.add(result)
-        if stopping.at is not None:
-            dropped = self._queue.drop(job.cell.fingerprint)
-            self._left[job.key.settings] -= dropped
-            self._progress.stopped(job.cell, stopping.at, dropped)
 
 
 class Deadline:

@@ -7,7 +7,6 @@ import logging
 import sqlite3
 import threading
 import time
-from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from contextlib import closing
 from dataclasses import dataclass
@@ -18,8 +17,8 @@ from vlagents_ray.evaluate.artifacts.storage import PROVENANCE
 from vlagents_ray.evaluate.plan.config import EvalConfig, Tracker, fingerprint
 from vlagents_ray.evaluate.results.changes import IDENTITY
 from vlagents_ray.evaluate.results.database import FILE, WAIT_S
-from vlagents_ray.evaluate.results.reader import CellResults, Results
-from vlagents_ray.evaluate.results.summary import Group, summarize
+from vlagents_ray.evaluate.results.reader import Results
+from vlagents_ray.evaluate.results.summary import summarize
 from vlagents_ray.naming import plain
 from vlagents_ray.registry import require
 
@@ -43,30 +42,14 @@ class About:
     diffs: Sequence[Path]  # of the working trees from their commits
 
 
-class TrackerRun(ABC):
-    """One run in one tracker. Its methods may raise anything; the caller handles it."""
+class WandbRun:
+    """A run whose curves are drawn against `training_step`; values without a step are in its summary.
 
-    @abstractmethod
+    The methods of a run, in any tracker, may raise anything; the caller handles it.
+    """
+
     def __init__(self, about: About) -> None:
         """Begin the run, or resume it."""
-
-    @abstractmethod
-    def log(self, metrics: Mapping[str, float], step: int | None) -> None:
-        """Log values at a training step; without a step they are the only values of the run."""
-
-    @abstractmethod
-    def videos(self, label: str, paths: Sequence[Path], step: int | None) -> None:
-        """Upload videos of episodes of the suite and env `label`, the prefix of its values' names."""
-
-    @abstractmethod
-    def finish(self) -> None:
-        """Send the buffered values, and end the run."""
-
-
-class WandbRun(TrackerRun):
-    """A run whose curves are drawn against `training_step`; values without a step are in its summary."""
-
-    def __init__(self, about: About) -> None:
         self._wandb: Any = require("wandb")
         self._id = about.id
         # Code is in the config and in an artifact, as wandb would only read the driver's folder.
@@ -81,16 +64,19 @@ class WandbRun(TrackerRun):
             self._artifact("code", "code", about.diffs)
 
     def log(self, metrics: Mapping[str, float], step: int | None) -> None:
+        """Log values at a training step; without a step they are the only values of the run."""
         if step is None:
             self._run.summary.update(dict(metrics))
         else:
             self._run.log({STEP: step, **metrics})
 
     def videos(self, label: str, paths: Sequence[Path], step: int | None) -> None:
+        """Upload videos of episodes of the suite and env `label`, the prefix of its values' names."""
         at = "" if step is None else f"-{step}"
         self._artifact(f"videos-{plain(label.replace('/', '_'))}{at}", "videos", paths)
 
     def finish(self) -> None:
+        """Send the buffered values, and end the run."""
         self._run.finish()
 
     def _artifact(self, name: str, kind: str, paths: Sequence[Path]) -> None:
@@ -118,7 +104,7 @@ class TrackioRun(WandbRun):
         self._run.log(shown, step=step or 0)
 
 
-class TensorboardRun(TrackerRun):
+class TensorboardRun:
     """Scalars and texts. TensorBoard plays no MP4, so that the paths of videos are logged."""
 
     def __init__(self, about: About) -> None:
@@ -154,6 +140,7 @@ class TensorboardRun(TrackerRun):
         self._writer.flush()
 
 
+TrackerRun = WandbRun | TensorboardRun
 _RUNS: dict[str, type[TrackerRun]] = {"wandb": WandbRun, "trackio": TrackioRun, "tensorboard": TensorboardRun}
 
 
@@ -213,13 +200,25 @@ class TrackerFeed:
     def _log_to(self, name: Tracker, results: Results) -> None:
         with closing(sqlite3.connect(self._config.out / FILE, timeout=WAIT_S)) as db:
             logged = dict(db.execute("SELECT what, episodes FROM tracked WHERE tracker = ?", (name,)))
-            for part, cells, group in _parts(results):
-                if not all(map(_complete, cells)) or logged.get(part) == group.episodes:
+            summary, policies = summarize(results), results.contenders
+            parts = [(one.cell, [one], group) for one, group in zip(results.cells, summary.cells, strict=True)]
+            parts += [(one, results.of(one), group) for one, group in zip(policies, summary.totals, strict=True)]
+            for part, cells, group in parts:  # each cell, then each policy id
+                over = all(
+                    cell.stopped_at is not None or sum(not one.beyond for one in cell.episodes) >= cell.planned
+                    for cell in cells
+                )
+                if not over or logged.get(part) == group.episodes:
                     continue
                 run = self._run(name, results, cells[0].policy)
-                run.log(_metrics(group), cells[0].step)
-                if part == cells[0].cell and (videos := self._videos(cells[0])):
-                    run.videos(_label(group), videos, cells[0].step)
+                rates = {"success_once": group.success_once.rate, "success_at_end": group.success_at_end.rate}
+                values = rates | {"return": group.mean_return, "steps": group.mean_steps, "episodes": group.episodes}
+                label = "/".join(filter(None, (group.suite, group.env)))
+                run.log({f"{label}/{k}": float(v) for k, v in values.items() if v is not None}, cells[0].step)
+                ordered = sorted(cells[0].episodes, key=lambda one: bool(one.result.success_once))
+                paths = [self._config.out / path for one in ordered for path in one.videos[:1]]
+                if part == cells[0].cell and (videos := paths[: self._config.tracking.videos]):
+                    run.videos(label, videos, cells[0].step)
                 with db:
                     db.execute("INSERT OR REPLACE INTO tracked VALUES (?, ?, ?)", (name, part, group.episodes))
 
@@ -241,35 +240,3 @@ class TrackerFeed:
             {"evaluation": results.runs[-1].config, "served": served, "code": code},
             sorted((out / PROVENANCE).glob("*.diff")),
         )  # fmt: skip
-
-    def _videos(self, cell: CellResults) -> list[Path]:
-        ordered = sorted(cell.episodes, key=lambda one: bool(one.result.success_once))
-        paths = [self._config.out / path for one in ordered for path in one.videos[:1]]
-        return paths[: self._config.tracking.videos]
-
-
-def _parts(results: Results) -> list[tuple[str, list[CellResults], Group]]:
-    """Return the groups that are logged together, as (key, cells, aggregates): each cell, then each policy id."""
-    summary = summarize(results)
-    alone = [(cell.cell, [cell], group) for cell, group in zip(results.cells, summary.cells, strict=True)]
-    totals = zip(results.contenders, summary.totals, strict=True)
-    return alone + [(contender, results.of(contender), group) for contender, group in totals]
-
-
-def _complete(cell: CellResults) -> bool:
-    return cell.stopped_at is not None or sum(not one.beyond for one in cell.episodes) >= cell.planned
-
-
-def _label(group: Group) -> str:
-    return "/".join(filter(None, (group.suite, group.env)))
-
-
-def _metrics(group: Group) -> dict[str, float]:
-    values = {
-        "success_once": group.success_once.rate,
-        "success_at_end": group.success_at_end.rate,
-        "return": group.mean_return,
-        "steps": group.mean_steps,
-        "episodes": group.episodes,
-    }
-    return {f"{_label(group)}/{name}": float(value) for name, value in values.items() if value is not None}

@@ -138,16 +138,6 @@ def tensors(pa: Any, values: np.ndarray) -> Any:
     return pa.FixedShapeTensorArray.from_numpy_ndarray(values)
 
 
-def constant(pa: Any, text: str, rows: int) -> Any:
-    """Return a column that has the same text in each row."""
-    return pa.DictionaryArray.from_arrays(pa.array(np.zeros(rows, np.int32)), pa.array([text]))
-
-
-def words(pa: Any, texts: list[str]) -> Any:
-    """Return a column of texts with many repetitions."""
-    return pa.array(texts, pa.string()).dictionary_encode()
-
-
 def at_rows(pa: Any, values: np.ndarray, rows: np.ndarray) -> Any:
     """Return a column of lists: the next of (N, ...) `values` at each true row of `rows`, (T,) bool, else nothing."""
     offsets = np.append(0, np.cumsum(rows)).astype(np.int32)

@@ -6,7 +6,6 @@ import asyncio
 import json
 import logging
 import os
-from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from contextlib import closing, suppress
 from dataclasses import asdict
@@ -26,7 +25,7 @@ from vlagents_ray.protocol.frames import read_error
 from vlagents_ray.serve.endpoints.weights import PATH
 from vlagents_ray.serve.engine.engine import Engine
 from vlagents_ray.serve.scaling.weight_push import ThisReplica, Values, WeightPusher, WeightsReplica
-from vlagents_ray.serve.weights import PushMode, PushOptions, PushResult, Rest
+from vlagents_ray.serve.weights import PushMode, PushOptions, Rest
 from vlagents_ray.weights.safetensors import MESSAGE_BYTES, header_of, parts_of
 from vlagents_ray.weights.shared_values import NotShared, gpu_of, shared
 from vlagents_ray.weights.trainable import is_array, portable
@@ -68,7 +67,7 @@ class Publisher:
         Raises:
             ConfigError: The target is none of these, or this process is in no Ray cluster.
         """
-        self._target: WeightsTarget
+        self._target: EngineTarget | AppTarget | ServerTarget
         if isinstance(target, Engine):
             self._target = EngineTarget(target)
         elif isinstance(target, str) and target.startswith("serve://"):
@@ -170,24 +169,12 @@ class Publisher:
         self.close()
 
 
-class WeightsTarget(ABC):
-    """A policy that takes new weights."""
+class EngineTarget:
+    """An engine in this process; tensors are copied once, on their device.
 
-    @abstractmethod
-    def push(self, named: Mapping[str, Any], options: PushOptions) -> int:
-        """Push new weights to the policy, and return their version; see `Publisher.push`."""
-
-    @abstractmethod
-    def rest(self, rest: Rest) -> None:
-        """Let all replicas take a step of a rest."""
-
-    @abstractmethod
-    def versions(self) -> list[int]:
-        """Return the newest version of each replica."""
-
-
-class EngineTarget(WeightsTarget):
-    """An engine in this process; tensors are copied once, on their device."""
+    The three targets have the same methods: `push` returns the version, `rest` lets all replicas take a step of a rest,
+    and `versions` returns the newest version of each replica.
+    """
 
     def __init__(self, engine: Engine) -> None:
         """Push to that engine alone."""
@@ -206,7 +193,7 @@ class EngineTarget(WeightsTarget):
         return [self._engine.weights.number]
 
 
-class AppTarget(WeightsTarget):
+class AppTarget:
     """An application of the Ray cluster that this process is in.
 
     If the learner and all replicas have their weights on the same GPU, the replicas copy them there. Otherwise the
@@ -234,15 +221,13 @@ class AppTarget(WeightsTarget):
         return self._push([ray.put(_portable(named))], options)
 
     def _push(self, values: Values, options: PushOptions) -> int:
-        result: PushResult = self._call("push_weights", values, options, timeout_s=_PUSH_S)
-        return result.version
+        return int(self._call("push_weights", values, options, timeout_s=_PUSH_S).version)
 
     def rest(self, rest: Rest) -> None:
         self._call("rest", rest, timeout_s=_PUSH_S)
 
     def versions(self) -> list[int]:
-        found: list[int] = self._call("versions_of_weights", timeout_s=_ANSWER_S)
-        return found
+        return list(self._call("versions_of_weights", timeout_s=_ANSWER_S))
 
     def _call(self, method: str, *args: Any, timeout_s: float) -> Any:
         import ray
@@ -260,7 +245,7 @@ class AppTarget(WeightsTarget):
             raise _unknown(f"serve://{self._app}", error) from error
 
 
-class ServerTarget(WeightsTarget):
+class ServerTarget:
     """A server, also on another machine; each push sends the values in parts over a new WebSocket."""
 
     def __init__(self, url: str, credentials: Credentials) -> None:
@@ -309,8 +294,7 @@ class ServerTarget(WeightsTarget):
 
     def versions(self) -> list[int]:
         with closing(HttpTransport(self._base, CodecChoice("raw"), self._credentials)) as http:
-            found: list[int] = http.get(PATH, _ANSWER_S)["versions"]
-        return found
+            return list(http.get(PATH, _ANSWER_S)["versions"])
 
 
 def _portable(named: Mapping[str, Any]) -> dict[str, Any]:

@@ -13,7 +13,7 @@ from vlagents_ray.contract import Contract
 from vlagents_ray.errors import ConfigError, WeightsLost
 from vlagents_ray.evaluate.plan.cases import require_envs
 from vlagents_ray.evaluate.plan.config import EvalConfig, PushedWeights
-from vlagents_ray.evaluate.report.progress import Progress
+from vlagents_ray.evaluate.report.terminal import Progress
 from vlagents_ray.evaluate.results.database import FILE
 from vlagents_ray.evaluate.results.summary import Summary
 from vlagents_ray.evaluate.run import evaluate
@@ -95,30 +95,24 @@ class TrainingEvaluation:
         """
         begun = monotonic()
         try:
-            if isinstance(self._policy, Agent):
-                return self._play_here(self._policy, version)
-            return self._play_served(self._policy, version)
+            if isinstance(agent := self._policy, str):
+                transport, timeout_s = self._plan.policies[0].transport, self._plan.connect_timeout_s
+                with RemoteAgent(agent, transport=transport, connect_timeout_s=timeout_s) as remote:
+                    newest = (remote.metadata.get("policy_version") or {}).get("newest") or {}
+                if newest.get("version") != version:
+                    raise WeightsLost(
+                        f"version: got {version}, but the newest that {agent} acts with is {newest.get('version')}; "
+                        f"want what the last push returned, once `acknowledged` counts all replicas"
+                    )
+                return evaluate(self._of(PushedWeights(**newest), url=agent), progress=self._progress)
+            pushed = PushedWeights(version=version, fingerprint=fingerprint(agent.parameters()))
+            session = _EvaluatedSession(agent, AgentCopies(agent), pushed)
+            with evaluation_mode(None if agent.trainable is None else attrgetter(agent.trainable)(agent)):
+                plan = self._of(pushed)
+                return evaluate(plan, agent_factory=lambda: session, in_process=True, progress=self._progress)
         finally:
             self._last_s = monotonic() - begun
             self._spent_s += self._last_s
-
-    def _play_here(self, agent: Agent, version: int) -> Summary:
-        pushed = PushedWeights(version=version, fingerprint=fingerprint(agent.parameters()))
-        session = _EvaluatedSession(agent, AgentCopies(agent), pushed)
-        trained = None if agent.trainable is None else attrgetter(agent.trainable)(agent)
-        with evaluation_mode(trained):
-            return evaluate(self._of(pushed), agent_factory=lambda: session, in_process=True, progress=self._progress)
-
-    def _play_served(self, url: str, version: int) -> Summary:
-        policy = self._plan.policies[0]
-        with RemoteAgent(url, transport=policy.transport, connect_timeout_s=self._plan.connect_timeout_s) as remote:
-            newest = (remote.metadata.get("policy_version") or {}).get("newest") or {}
-        if newest.get("version") != version:
-            raise WeightsLost(
-                f"version: got {version}, but the newest that {url} acts with is {newest.get('version')}; want what "
-                f"the last push returned, once `acknowledged` counts all replicas"
-            )
-        return evaluate(self._of(PushedWeights(**newest), url=url), progress=self._progress)
 
     def _of(self, pushed: PushedWeights, url: str | None = None) -> EvalConfig:
         policy = self._plan.policies[0].model_copy(update={"source": None, "url": url, "pushed_weights": pushed})

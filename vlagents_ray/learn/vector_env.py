@@ -16,9 +16,11 @@ from vlagents_ray.interface import Act, Obs
 from vlagents_ray.learn.columns import EXTRA
 from vlagents_ray.registry import require
 
-# The Gymnasium spaces of an environment's contract, and its observations as members of them.
+gymnasium: Any = require("gymnasium", extra=EXTRA)
+vector: Any = require("gymnasium.vector", extra=EXTRA)
 
 Observation = Literal["all", "state"]
+_RESET_MASK = "reset_mask"  # Gymnasium's name of the option
 
 
 def action_space(spaces: Any, contract: Contract) -> Any:
@@ -70,12 +72,6 @@ def _stated(size: int | None, what: str) -> int:
     if size is None:
         raise ConfigError(f"{what}: the env's contract does not state it, but Gymnasium wants to know; state it there")
     return size
-
-
-gymnasium: Any = require("gymnasium", extra=EXTRA)
-vector: Any = require("gymnasium.vector", extra=EXTRA)
-
-_RESET_MASK = "reset_mask"  # Gymnasium's name of the option
 
 
 def as_vector_env(
@@ -179,8 +175,10 @@ class BatchVectorEnv(vector.VectorEnv):  # type: ignore[misc]
             The observations, and the infos.
         """
         given = dict(options or {})
-        mask = given.pop(_RESET_MASK, None)
-        which = np.ones(self.num_envs, np.bool_) if mask is None else _checked(mask, self.num_envs)
+        which, n = given.pop(_RESET_MASK, None), self.num_envs
+        which = np.ones(n, np.bool_) if which is None else which
+        if not isinstance(which, np.ndarray) or which.dtype != np.bool_ or which.shape != (n,) or not which.any():
+            raise ConfigError(f"{_RESET_MASK}: got {which!r}, want a bool array of shape ({n},), true somewhere")
         stated = None if seed is None or isinstance(seed, int) else _seeds(seed, which)
         super().reset(seed=seed if stated is None else stated[0])
         if stated is not None:
@@ -202,7 +200,13 @@ class BatchVectorEnv(vector.VectorEnv):  # type: ignore[misc]
         Returns:
             The observations, rewards (N,) float64, terminated (N,) bool, truncated (N,) bool, and the infos.
         """
-        self._require_begun()
+        if not self._seen:
+            raise NotReset("step before reset; call reset(seed=...) first")
+        if self._over.any() and self._autoreset == vector.AutoresetMode.DISABLED:
+            raise NotReset(
+                f"environments {np.flatnonzero(self._over).tolist()} are over, and autoreset is disabled; call "
+                f"reset(options={{'reset_mask': ...}})"
+            )
         rows = np.asarray(actions, np.float32)
         if rows.shape != self.action_space.shape:
             raise InvalidAction(f"actions: got {rows.shape}, want {self.action_space.shape}, a row an environment")
@@ -287,15 +291,6 @@ class BatchVectorEnv(vector.VectorEnv):  # type: ignore[misc]
             return np.stack(rows)
         return {name: np.stack([row[name] for row in rows]) for name in self.single_observation_space}
 
-    def _require_begun(self) -> None:
-        if not self._seen:
-            raise NotReset("step before reset; call reset(seed=...) first")
-        if self._over.any() and self._autoreset == vector.AutoresetMode.DISABLED:
-            raise NotReset(
-                f"environments {np.flatnonzero(self._over).tolist()} are over, and autoreset is disabled; call "
-                f"reset(options={{'reset_mask': ...}})"
-            )
-
 
 def _seeds(seeds: Sequence[int | None], which: np.ndarray) -> list[int]:
     """Return the seeds of the environments that begin an episode, from a list for all environments."""
@@ -305,9 +300,3 @@ def _seeds(seeds: Sequence[int | None], which: np.ndarray) -> list[int]:
     if not found or not all(isinstance(one, (int, np.integer)) and one >= 0 for one in found):
         raise InvalidInput(f"seed: got {list(seeds)}, want a whole number for each environment that begins an episode")
     return [int(one) for one in found if one is not None]
-
-
-def _checked(mask: Any, number: int) -> np.ndarray:
-    if not isinstance(mask, np.ndarray) or mask.dtype != np.bool_ or mask.shape != (number,) or not mask.any():
-        raise ConfigError(f"{_RESET_MASK}: got {mask!r}, want a bool array of shape ({number},), true somewhere")
-    return mask

@@ -126,8 +126,18 @@ class RecordedDataset:
         for i in range(part.length):
             shown = {}
             for name, camera in cameras.items():
-                image = next(videos[name]) if name in videos else _image(rows[name][i])
-                shown[camera] = self._cropped(image, camera)
+                if name in videos:
+                    image = next(videos[name])
+                elif data := rows[name][i].get("bytes"):
+                    image = jpeg_png.decode(data, DEFAULT_LIMITS.pixels)
+                else:
+                    path = rows[name][i].get("path")
+                    raise ConfigError(f"a picture is at {path!r}, want its bytes in the table; LeRobot embeds them")
+                spec = None if self.contract is None else (self.contract.contract.cameras or {}).get(camera)
+                if spec is not None and spec.height is not None and spec.width is not None:
+                    # Without the row and the column that were added to make the size of its video even.
+                    image = np.ascontiguousarray(image[: spec.height, : spec.width])
+                shown[camera] = image
             state, gripper = divided_state(
                 {name: np.atleast_1d(np.array(rows[name][i], np.float32)) for name in states}, states
             )
@@ -214,24 +224,10 @@ class RecordedDataset:
             found[STATE] = state_parts(widths[STATE], policy, names.state, option="--state joints,gripper")
         return found
 
-    def _cropped(self, image: np.ndarray, camera: str) -> np.ndarray:
-        """Return the image without the row and the column that were added to make the size of its video even."""
-        spec = None if self.contract is None else (self.contract.contract.cameras or {}).get(camera)
-        if spec is None or spec.height is None or spec.width is None:
-            return image
-        return np.ascontiguousarray(image[: spec.height, : spec.width])
-
 
 def find_datasets(folder: Path) -> list[Path]:
     """Return the datasets in a folder, or the folder itself if it is a dataset."""
     return [path.parents[1] for pattern in ("", "*/") for path in sorted(folder.glob(f"{pattern}meta/info.json"))]
-
-
-def _image(value: Mapping[str, Any]) -> np.ndarray:
-    """Decode an image that is stored in the table."""
-    if not value.get("bytes"):
-        raise ConfigError(f"a picture is at {value.get('path')!r}, want its bytes in the table; LeRobot embeds them")
-    return jpeg_png.decode(value["bytes"], DEFAULT_LIMITS.pixels)
 
 
 def _values(text: str) -> dict[str, Any]:

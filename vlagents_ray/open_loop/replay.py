@@ -21,7 +21,14 @@ from vlagents_ray.contract import Contract
 from vlagents_ray.errors import ConfigError, PolicyFailed, VLAgentsError
 from vlagents_ray.evaluate.artifacts.storage import storing, whole
 from vlagents_ray.interface import Act, Agent, Obs
-from vlagents_ray.open_loop.recorded import Names, RecordedDataset, RecordedEpisode, RecordedSession, find_datasets
+from vlagents_ray.open_loop.recorded import (
+    Names,
+    RecordedDataset,
+    RecordedEpisode,
+    RecordedSession,
+    RecordedStep,
+    find_datasets,
+)
 from vlagents_ray.protocol.messages import Reply, Request
 from vlagents_ray.serve.config.deployment import ServerArgs
 from vlagents_ray.serve.engine.engine import Engine
@@ -207,9 +214,7 @@ class OpenLoopResult:
         }
 
 
-def replay(
-    folder: Path, sessions: Sessions, plan: ReplayPlan, progress: Callable[[int, int], None] = lambda *_: None
-) -> OpenLoopResult:
+def replay(folder: Path, sessions: Sessions, plan: ReplayPlan) -> OpenLoopResult:
     """Query a policy at each frame, and compare its actions with the dataset's.
 
     A session is reset with its first recorded observation, its instruction and its options, and then receives each of
@@ -234,17 +239,26 @@ def replay(
         ErrorTable(len(first.joints)),
     )
     result.missing = sum(part.dataset.gaps(part) for play in plays for part in play.parts)
-    run = _Replaying(result, plan, threading.Lock())
+    lock = threading.Lock()
 
     def one(play: RecordedSession) -> None:
         agent = sessions()
         try:
-            run.play(play, agent)
+            for part, step, got in _answers(play, agent, plan):
+                expected = step.expected
+                if got.shape[1] != expected.shape[1]:
+                    raise ConfigError(
+                        f"{part.dataset.root}: its actions have {expected.shape[1]} numbers, those of the policy "
+                        f"{got.shape[1]}; want a policy of the same robot and control mode"
+                    )
+                rows = min(len(expected), len(got), plan.horizon or len(got))
+                with lock:
+                    mae = result.table.add(expected[:rows], got[:rows])
+                    result.frames.append(FrameError(part.dataset.root.name, part.index, step.frame, mae))
         finally:
             agent.close()
-        with run.lock:
+        with lock:
             result.sessions += 1
-            progress(result.sessions, len(plays))
 
     with ThreadPoolExecutor(plan.at_once, "open-loop") as threads:
         futures = [threads.submit(one, play) for play in plays]
@@ -257,43 +271,25 @@ def replay(
     return result
 
 
-@dataclass
-class _Replaying:
-    result: OpenLoopResult
-    plan: ReplayPlan
-    lock: threading.Lock
-
-    def play(self, play: RecordedSession, agent: Agent) -> None:
-        begun = False
-        for part in play.parts:
-            for step in self._steps(part, agent):
-                try:
-                    if not begun:
-                        chosen = CHOICE, STEP, OPTION  # options that choose its weights
-                        options = {name: one for name, one in play.options.items() if name not in chosen}
-                        agent.reset(step.obs, part.instruction, **options)
-                        begun = True
-                    got = agent.act(step.obs).rows()
-                except VLAgentsError as error:
-                    where = f"{part.dataset.root}, episode {part.index}, frame {step.frame}"
-                    raise PolicyFailed(f"{where}: {error}") from error
-                self._compare(part, step.frame, step.expected, got)
-
-    def _steps(self, part: RecordedEpisode, agent: Agent) -> Any:
-        every = 1 if part.dataset.traced else self.plan.every
-        return islice(part.dataset.steps(part, self.plan.names, agent.contract), 0, None, every)
-
-    def _compare(self, part: RecordedEpisode, frame: int, expected: np.ndarray, got: np.ndarray) -> None:
-        if got.shape[1] != expected.shape[1]:
-            raise ConfigError(
-                f"{part.dataset.root}: its actions have {expected.shape[1]} numbers, those of the policy "
-                f"{got.shape[1]}; want a policy of the same robot and control mode"
-            )
-        rows = min(len(expected), len(got), self.plan.horizon or len(got))
-        expected, got = expected[:rows], got[:rows]
-        with self.lock:
-            mae = self.result.table.add(expected, got)
-            self.result.frames.append(FrameError(part.dataset.root.name, part.index, frame, mae))
+def _answers(
+    play: RecordedSession, agent: Agent, plan: ReplayPlan
+) -> Iterator[tuple[RecordedEpisode, RecordedStep, np.ndarray]]:
+    """Yield the frames of a session, each with the policy's action, (H, D)."""
+    begun = False
+    for part in play.parts:
+        every = 1 if part.dataset.traced else plan.every
+        for step in islice(part.dataset.steps(part, plan.names, agent.contract), 0, None, every):
+            try:
+                if not begun:
+                    chosen = CHOICE, STEP, OPTION  # options that choose its weights
+                    options = {name: one for name, one in play.options.items() if name not in chosen}
+                    agent.reset(step.obs, part.instruction, **options)
+                    begun = True
+                got = agent.act(step.obs).rows()
+            except VLAgentsError as error:
+                where = f"{part.dataset.root}, episode {part.index}, frame {step.frame}"
+                raise PolicyFailed(f"{where}: {error}") from error
+            yield part, step, got
 
 
 def write_result(result: OpenLoopResult, policy: str, folder: Path) -> Path:

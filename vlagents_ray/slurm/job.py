@@ -86,13 +86,16 @@ class Allocation:
     @classmethod
     def here(cls, environ: Mapping[str, str] = os.environ) -> Allocation:
         cpus = int(environ["SLURM_CPUS_ON_NODE"])
+        gpus = len([one for one in environ.get("SLURM_STEP_GPUS", "").split(",") if one])
+        # Slurm counts MiB, and 0 means all of the node's.
+        mebibytes = int(environ.get("SLURM_MEM_PER_NODE", "0")) or int(environ.get("SLURM_MEM_PER_CPU", "0")) * cpus
         return cls(
             job=int(environ["SLURM_JOB_ID"]),
             nodes=int(environ["SLURM_JOB_NUM_NODES"]),
             node=int(environ.get("SLURM_NODEID", "0")),
             cpus=min(cpus, len(os.sched_getaffinity(0))),  # a task may be bound to fewer
-            gpus=_gpus(environ),
-            memory=_memory(environ, cpus),
+            gpus=int(environ.get("SLURM_GPUS_ON_NODE", gpus)),
+            memory=mebibytes * 2**20 or None,
         )
 
     @property
@@ -116,18 +119,6 @@ class Allocation:
         # The other listeners use free ports, since Ray's defaults are the same numbers for every cluster.
         free = ["--min-worker-port=0", "--max-worker-port=0", "--dashboard-agent-listen-port=0"]
         return ["ray", "start", *where, *given, *free, f"--temp-dir={folder}/{FILES}", *_REST]
-
-
-def _gpus(environ: Mapping[str, str]) -> int:
-    if (count := environ.get("SLURM_GPUS_ON_NODE")) is not None:
-        return int(count)
-    return len([one for one in environ.get("SLURM_STEP_GPUS", "").split(",") if one])
-
-
-def _memory(environ: Mapping[str, str], cpus: int) -> int | None:
-    """Return the memory in bytes; Slurm counts MiB, and 0 means all of the node's."""
-    mebibytes = int(environ.get("SLURM_MEM_PER_NODE", "0")) or int(environ.get("SLURM_MEM_PER_CPU", "0")) * cpus
-    return mebibytes * 2**20 or None
 
 
 def run_node() -> int:
@@ -190,7 +181,18 @@ def run_command(arguments: Sequence[str]) -> None:
             words += [f"--workers={max(1, int((cpus - 1) / given.fill))}", f"--worker-cpus={given.fill:g}"]
         words += [] if end is None else [f"--end-at={end - given.closing:.0f}"]
     else:
-        words += _server_options(given, allocation)
+        from vlagents_ray.serve.access.key_store import new_key
+
+        folder = Path(os.environ["RAY_AUTH_TOKEN_PATH"]).parent  # the job's folder, which only its user can read
+        port, key = given.port or allocation.ports.serve, ""
+        words += ["--host=0.0.0.0", f"--port={port}"]
+        if given.key:
+            keys = folder / "keys.json"
+            keys.unlink(missing_ok=True)  # keys from before the job was requeued
+            key = new_key(keys, f"job-{allocation.job}")
+            words.append(f"--keys={keys}")
+        announcing = [sys.executable, "-m", "vlagents_ray.slurm.job", "announce", str(folder), str(port), *given.app]
+        subprocess.Popen(announcing, env=os.environ | {KEY_VARIABLE: key})  # noqa: S603 - our own arguments
     os.execv(sys.executable, [sys.executable, "-c", _COMMAND, given.what, *words])  # noqa: S606 - no shell
 
 
@@ -233,24 +235,6 @@ def end_of_job(job: int) -> float | None:
     command = ["squeue", "--noheader", f"--jobs={job}", "--format=%e"]
     end = subprocess.run(command, check=True, capture_output=True, text=True).stdout.strip()  # noqa: S603
     return None if end in ("NONE", "Unknown", "N/A") else datetime.datetime.fromisoformat(end).timestamp()
-
-
-def _server_options(given: argparse.Namespace, allocation: Allocation) -> list[str]:
-    """Return the options of `serve` for its address and keys, and start the process that announces them."""
-    from vlagents_ray.serve.access.key_store import new_key
-
-    folder = Path(os.environ["RAY_AUTH_TOKEN_PATH"]).parent  # the job's folder, which only its user can read
-    port = given.port or allocation.ports.serve
-    words = ["--host=0.0.0.0", f"--port={port}"]
-    key = ""
-    if given.key:
-        keys = folder / "keys.json"
-        keys.unlink(missing_ok=True)  # keys from before the job was requeued
-        key = new_key(keys, f"job-{allocation.job}")
-        words.append(f"--keys={keys}")
-    announcing = [sys.executable, "-m", "vlagents_ray.slurm.job", "announce", str(folder), str(port), *given.app]
-    subprocess.Popen(announcing, env=os.environ | {KEY_VARIABLE: key})  # noqa: S603 - our own arguments
-    return words
 
 
 def announce(words: Sequence[str]) -> None:

@@ -132,10 +132,13 @@ class Script:
             "open-mode": "append",
             **({} if "no-requeue" in self.options else {"requeue": None}),
         }
-        words = [
-            f"--{option}" if value is None else f"--{option}={_quoted(value)}"
-            for option, value in (defaults | dict(self.options)).items()
-        ]
+        words = []
+        for option, value in (defaults | dict(self.options)).items():
+            spaced = value is not None and any(sign.isspace() for sign in value)
+            if value is not None and spaced and '"' in value:
+                raise ConfigError(f"slurm: got the option {value[:200]!r}, want no quotes in a value with spaces")
+            given = f'="{value}"' if spaced else f"={value}"
+            words.append(f"--{option}{'' if value is None else given}")
         for word in (self.name, str(self.folder), *words):
             if any(ord(sign) < ord(" ") or sign in _LINE_ENDS for sign in word):
                 raise ConfigError(f"slurm: got {word[:200]!r}, want no control characters, such as line feeds, in it")
@@ -156,15 +159,6 @@ class Script:
             "",
         ]
         return "\n".join(lines) + "\n" + BODY.read_text()
-
-
-def _quoted(value: str) -> str:
-    """Quote a value with spaces for a line of #SBATCH."""
-    if not any(sign.isspace() for sign in value):
-        return value
-    if '"' in value:
-        raise ConfigError(f"slurm: got the option {value[:200]!r}, want no quotes in a value with spaces")
-    return f'"{value}"'
 
 
 class SubmissionFailed(VLAgentsError):

@@ -42,7 +42,17 @@ def check_env(
     Raises:
         ContractViolation: The environment does not implement the interface; the message names the place.
     """
-    suite = _Suite(env, _check_static(env), options)
+    contract = env.contract
+    if not isinstance(contract, Contract):
+        raise ContractViolation(f"contract: got {type(contract).__name__}, want a Contract")
+    if contract.action.dim is None:
+        raise ContractViolation("contract.action.dim: got None, want the number of components of an action")
+    if type(env.max_steps) is not int or env.max_steps < 1:
+        raise ContractViolation(f"max_steps: got {env.max_steps!r}, want an int of at least 1")
+    require_wireable(env.describe(), "describe()")
+    if not all(isinstance(name, str) for name in env.tasks()):
+        raise ContractViolation(f"tasks(): got {env.tasks()!r}, want a list of names")
+    suite = _Suite(env, contract, options)
     actions = suite.random_actions(steps)
     first = suite.play(seeds[0], actions)
     other = suite.play(seeds[1], actions)
@@ -71,20 +81,6 @@ class _Rollout:
     given: list[Obs]  # the env's own objects
     seen: list[Obs]  # copies of them, made immediately
     outcomes: list[Any]
-
-
-def _check_static(env: EvalEnv) -> Contract:
-    contract = env.contract
-    if not isinstance(contract, Contract):
-        raise ContractViolation(f"contract: got {type(contract).__name__}, want a Contract")
-    if contract.action.dim is None:
-        raise ContractViolation("contract.action.dim: got None, want the number of components of an action")
-    if type(env.max_steps) is not int or env.max_steps < 1:
-        raise ContractViolation(f"max_steps: got {env.max_steps!r}, want an int of at least 1")
-    require_wireable(env.describe(), "describe()")
-    if not all(isinstance(name, str) for name in env.tasks()):
-        raise ContractViolation(f"tasks(): got {env.tasks()!r}, want a list of names")
-    return contract
 
 
 @dataclass(slots=True)

@@ -44,12 +44,23 @@ def set_values(trainable: Any, named: Mapping[str, Any]) -> None:
     Values on a GPU are copied to the addresses of the old ones, which a CUDA graph may have recorded. All
     others are replaced by reference, which takes no time and no memory; `named` must not be changed afterwards.
     """
-    if _is_module(trainable):
-        _set_tensors(trainable, named)
+    if not _is_module(trainable):
+        for name, container, key in list(_leaves(trainable)):
+            if name in named:
+                container[key] = named[name]
         return
-    for name, container, key in list(_leaves(trainable)):
-        if name in named:
-            container[key] = named[name]
+    held = {
+        **dict(trainable.named_buffers(remove_duplicate=False)),
+        **dict(trainable.named_parameters(remove_duplicate=False)),
+    }
+    with sys.modules["torch"].no_grad():
+        for name, alias in trainable.state_dict().items():
+            if name not in named:
+                continue
+            if name in held and alias.device.type == "cpu":
+                held[name].data = named[name]
+            else:
+                copy(named[name], alias) if alias.is_contiguous() else alias.copy_(named[name])
 
 
 @contextmanager
@@ -166,22 +177,6 @@ def is_array(value: Any) -> bool:
     return hasattr(value, "shape") and hasattr(value, "dtype")
 
 
-def _set_tensors(module: Any, named: Mapping[str, Any]) -> None:
-    torch = sys.modules["torch"]
-    held = {
-        **dict(module.named_buffers(remove_duplicate=False)),
-        **dict(module.named_parameters(remove_duplicate=False)),
-    }
-    with torch.no_grad():
-        for name, alias in module.state_dict().items():
-            if name not in named:
-                continue
-            if name in held and alias.device.type == "cpu":
-                held[name].data = named[name]
-            else:
-                copy(named[name], alias) if alias.is_contiguous() else alias.copy_(named[name])
-
-
 def _leaves(tree: Any, path: str = "") -> Iterator[tuple[str, Any, Any]]:
     """Yield name, container and key of each array."""
     if not isinstance(tree, dict | list):
@@ -240,6 +235,10 @@ def to_host(groups: Iterable[Mapping[str, Any]], moved: list[tuple[Any, Any]]) -
             storage.resize_(0)
 
 
+def _on_gpu(value: Any) -> bool:
+    return bool(value.device.type != "cpu")
+
+
 def from_host(moved: list[tuple[Any, Any]]) -> None:
     """Move tensors back, to other addresses; after an error, the list has those that were not moved yet."""
     while moved:
@@ -247,10 +246,6 @@ def from_host(moved: list[tuple[Any, Any]]) -> None:
         storage.resize_(host.nbytes())
         storage.copy_(host)
         moved.pop()
-
-
-def _on_gpu(value: Any) -> bool:
-    return bool(value.device.type != "cpu")
 
 
 # Checks that pushed values fit those of a policy, and a digest of values.
@@ -321,6 +316,7 @@ def require_fit(held: Mapping[str, Any], pushed: Mapping[str, Any], *, partial: 
         faults += [f"{name!r}: missing; push it, or set partial=True" for name in held if name not in pushed]
     elif not pushed:
         faults += ["no value: push at least one"]
+    # A variable with a value here would keep the learner's memory open as long as the error has this frame.
     faults += [fault for name in pushed if name in held and (fault := _misfit(name, pushed[name], held[name]))]
     _refuse(faults)
 

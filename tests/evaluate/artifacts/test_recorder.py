@@ -6,6 +6,7 @@ import hashlib
 import io
 import os
 from collections.abc import Callable
+from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
 
@@ -17,9 +18,15 @@ from in_process_evaluation import play
 
 from vlagents_ray.errors import ConfigError, EnvFailed
 from vlagents_ray.evaluate import ClockConfig, EvalConfig, PolicyConfig, SuiteConfig, WorkerConfig
-from vlagents_ray.evaluate.artifacts.recorder import Recording
-from vlagents_ray.evaluate.artifacts.trajectory import NO_VERSION, Trajectory, TrajectoryRecorder, videos_of
-from vlagents_ray.evaluate.artifacts.video import VideoRecorder, save_videos
+from vlagents_ray.evaluate.artifacts.recorder import (
+    NO_VERSION,
+    Recording,
+    Trajectory,
+    TrajectoryRecorder,
+    VideoRecorder,
+    save_videos,
+    videos_of,
+)
 from vlagents_ray.evaluate.episode.records import EpisodeResult
 from vlagents_ray.evaluate.episode.second_pass import PlayedEpisode
 from vlagents_ray.evaluate.plan.cases import EvalCase
@@ -116,7 +123,7 @@ def test_nothing_is_encoded_or_collected_unless_it_is_asked_for(
     monkeypatch.setattr(VideoRecorder, "add", fail)
     monkeypatch.setattr(TrajectoryRecorder, "add_observation", fail)
     monkeypatch.setattr(PlayedEpisode, "add_observation", fail)
-    with Recording(config(video="none", record="none"), 10.0) as recording:
+    with closing(Recording(config(video="none", record="none"), 10.0)) as recording:
         recording.add_observation(Obs(state={"position": np.zeros(1, np.float32)}))
         recording.add_action(np.zeros(1, np.float32), 0.0, False)
         assert recording.wants_images == "none"
@@ -161,7 +168,7 @@ COLOURS = [(200, 40, 40), (40, 200, 40), (40, 40, 200), (220, 220, 220), (20, 20
 
 
 def record(frames: list[np.ndarray], fps: float | None = None) -> dict[str, bytes]:
-    with VideoRecorder(fps) as recorder:
+    with closing(VideoRecorder(fps)) as recorder:
         for frame in frames:
             recorder.add(Obs(cameras={"front": frame}))
         return recorder.finish()
@@ -198,7 +205,7 @@ def test_odd_sizes_are_made_even() -> None:
 
 
 def test_every_camera_has_its_video() -> None:
-    with VideoRecorder() as recorder:
+    with closing(VideoRecorder()) as recorder:
         recorder.add(Obs(cameras={"front": plain(COLOURS[0], 128, 128), "wrist": plain(COLOURS[1])}))
         videos = recorder.finish()
     sizes = {}

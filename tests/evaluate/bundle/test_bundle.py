@@ -21,7 +21,7 @@ from typer.testing import CliRunner
 from vlagents_ray.cli.main import app
 from vlagents_ray.errors import ConfigError
 from vlagents_ray.evaluate import Results
-from vlagents_ray.evaluate.artifacts.trajectory import Trajectory
+from vlagents_ray.evaluate.artifacts.recorder import Trajectory
 from vlagents_ray.evaluate.bundle import Verification, verify, write_bundle
 from vlagents_ray.evaluate.merge import merge
 from vlagents_ray.evaluate.results.summary import summarize

@@ -23,7 +23,7 @@ from vlagents_ray.contract import ActionSpec, CameraSpec, Contract, StateSpec
 from vlagents_ray.dataset_contract import BYTES, INFO, STATISTICS, DatasetContract
 from vlagents_ray.errors import ConfigError
 from vlagents_ray.evaluate import EvalConfig, Results
-from vlagents_ray.evaluate.artifacts.trajectory import Trajectory
+from vlagents_ray.evaluate.artifacts.recorder import Trajectory
 from vlagents_ray.evaluate.exports import to_lerobot
 from vlagents_ray.interface import Act, Obs
 from vlagents_ray.robot.dataset import Dataset

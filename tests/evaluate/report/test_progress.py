@@ -21,10 +21,10 @@ from vlagents_ray.evaluate.plan.cases import EvalCase, cells
 from vlagents_ray.evaluate.plan.config import EvalConfig
 from vlagents_ray.evaluate.plan.jobs import EpisodeKey, Job, plan
 from vlagents_ray.evaluate.report import results_document
-from vlagents_ray.evaluate.report.progress import LineProgress, LiveProgress, Progress
 from vlagents_ray.evaluate.report.results_document import ProgressDocument, ResultsDocument
+from vlagents_ray.evaluate.report.terminal import LineProgress, LiveProgress, Progress
 from vlagents_ray.evaluate.results.reader import rate_of
-from vlagents_ray.evaluate.results.stopping import confidence_sequence
+from vlagents_ray.evaluate.results.statistics import confidence_sequence
 from vlagents_ray.evaluate.results.store import Store
 from vlagents_ray.evaluate.results.summary import summarize
 

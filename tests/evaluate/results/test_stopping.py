@@ -16,8 +16,7 @@ from vlagents_ray.evaluate.episode.records import EpisodeResult
 from vlagents_ray.evaluate.plan.config import StopConfig
 from vlagents_ray.evaluate.plan.jobs import EpisodeKey
 from vlagents_ray.evaluate.results.reader import rate_of
-from vlagents_ray.evaluate.results.statistics import wilson
-from vlagents_ray.evaluate.results.stopping import Stopping, confidence_sequence, pooled
+from vlagents_ray.evaluate.results.statistics import Stopping, confidence_sequence, pooled, wilson
 
 Config = Callable[..., EvalConfig]
 

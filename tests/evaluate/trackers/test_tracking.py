@@ -13,12 +13,12 @@ from in_process_evaluation import play
 
 from vlagents_ray.errors import MissingDependency
 from vlagents_ray.evaluate import EvalConfig, evaluate, trackers
-from vlagents_ray.evaluate.trackers import About, TrackerFeed, TrackerRun
+from vlagents_ray.evaluate.trackers import About, TrackerFeed
 
 Config = Callable[..., EvalConfig]
 
 
-class Listener(TrackerRun):
+class Listener:
     """Keeps what it is told."""
 
     begun: ClassVar[list[About]] = []

@@ -13,7 +13,7 @@ from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from recorded_sessions import recorded, seen
 
 from vlagents_ray.dataset_contract import BYTES, STATISTICS, DatasetContract
-from vlagents_ray.evaluate.artifacts.trajectory import Trajectory
+from vlagents_ray.evaluate.artifacts.recorder import Trajectory
 from vlagents_ray.evaluate.exports import to_lerobot
 from vlagents_ray.interface import Obs
 from vlagents_ray.robot.record import Recorder

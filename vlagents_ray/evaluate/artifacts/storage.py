@@ -16,9 +16,6 @@ from typing import Any
 
 from vlagents_ray.errors import ConfigError, StorageFailed
 from vlagents_ray.evaluate.episode.records import EpisodeResult
-from vlagents_ray.evaluate.plan.cases import EvalCase
-from vlagents_ray.evaluate.plan.jobs import EpisodeKey
-from vlagents_ray.naming import plain
 from vlagents_ray.ray_tools.git_state import GitState, code_in, code_of
 from vlagents_ray.registry import names
 
@@ -46,16 +43,6 @@ _SQLITE = {
     "unable to open database file": errno.EACCES,
     "disk I/O error": errno.EIO,
 }
-
-
-def episode_folder(out: Path, kind: str, cell: EvalCase) -> Path:
-    """`out/KIND/POLICY/SUITE/ENV`; a suite without a name has no folder."""
-    return out.joinpath(kind, *(plain(part) for part in cell.name if part))
-
-
-def stem(key: EpisodeKey) -> str:
-    """Return the beginning of the names of an episode's files, before "_" or "."."""
-    return f"ep{key.episode:04d}_seed{key.seed}"
 
 
 def require_below(path: str) -> str:
@@ -95,12 +82,6 @@ def require_there(path: Path) -> Path:
             f"evaluated, with its {VIDEOS}/ and {TRAJECTORIES}/"
         )
     return path
-
-
-def remove_old(folder: Path, key: EpisodeKey) -> None:
-    """Remove the files of an earlier attempt at the episode."""
-    for old in folder.glob(f"{stem(key)}[_.]*"):
-        old.unlink()
 
 
 def outcome(result: EpisodeResult) -> str:
@@ -160,20 +141,14 @@ def storing(folder: Path) -> Iterator[None]:
     try:
         yield
     except (OSError, sqlite3.OperationalError) as error:
-        found = error.errno if isinstance(error, OSError) else _number(error, folder)
+        found = error.errno if isinstance(error, OSError) else _SQLITE.get(str(error))
+        if isinstance(error, sqlite3.OperationalError) and found == errno.EACCES:
+            disk = os.statvfs(next(one for one in (folder, *folder.absolute().parents) if one.exists()))
+            found = errno.EROFS if disk.f_flag & os.ST_RDONLY else found
         if found not in _CURES:
             raise
         what, cure = _CURES[found]
         raise StorageFailed(f"{folder}: {what} ({error}); {cure}") from error
-
-
-def _number(error: sqlite3.OperationalError, folder: Path) -> int | None:
-    """Return the errno of an error of SQLite; None if it is not about the disk."""
-    number = _SQLITE.get(str(error))
-    disk = os.statvfs(next(one for one in (folder, *folder.absolute().parents) if one.exists()))
-    if number == errno.EACCES and disk.f_flag & os.ST_RDONLY:
-        return errno.EROFS
-    return number
 
 
 def driver_code() -> dict[str, GitState | None]:

@@ -2,17 +2,19 @@
 
 The episodes of a batch are played in lockstep: at each step, one request to the policy serves all that need an answer.
 A single environment is a batch of one. Each episode has the same result as if it were played alone, except for the
-times.
-"""
+times."""
 
 from __future__ import annotations
 
+import hashlib
 from collections import deque
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from time import perf_counter
 from typing import Any, Literal
+
+import numpy as np
 
 from vlagents_ray.client.agent import RemoteAgent
 from vlagents_ray.contract import Contract
@@ -27,12 +29,118 @@ from vlagents_ray.evaluate.episode.failures import (
     policy_side,
 )
 from vlagents_ray.evaluate.episode.latency import ChunkExecutor, Tick
-from vlagents_ray.evaluate.episode.records import EpisodeObserver, EpisodeResult
-from vlagents_ray.evaluate.episode.stats import EpisodeStats
+from vlagents_ray.evaluate.episode.records import Ending, EpisodeObserver, EpisodeResult, version_of
 from vlagents_ray.evaluate.plan.config import ClockConfig
 from vlagents_ray.evaluate.plan.jobs import EpisodeKey
-from vlagents_ray.interface import Act, Agent, Obs
+from vlagents_ray.interface import POLICY, Act, Agent, Obs
 from vlagents_ray.validation import check_action
+
+_LITTLE_ENDIAN = np.dtype("<f4")
+_KEPT = (  # what `EpisodeStats` counts as a result has it
+    "key", "steps", "episode_return", "reset_ms", "policy_seconds", "ticks_waited", "ticks_held", "checkpoint",
+    "weights", "revision", "policy_version", "policy_fingerprint", "first_policy_version",
+)  # fmt: skip
+
+
+@dataclass(slots=True)
+class EpisodeStats:
+    """The counts and measurements of an episode so far."""
+
+    key: EpisodeKey
+    started: float = field(default_factory=perf_counter)
+    steps: int = 0
+    episode_return: float = 0.0
+    success: bool = False
+    first_success: int | None = None
+    ending: Ending = "error"
+    instruction: str = ""  # the present one
+    earlier: list[str] = field(default_factory=list)  # instructions of this episode before it
+    checkpoint: str | None = None
+    weights: str | None = None
+    revision: str | None = None
+    policy_version: int | None = None
+    policy_fingerprint: str | None = None
+    first_policy_version: int | None = None
+    actions: Any = field(default_factory=hashlib.sha256)  # digest of the executed actions
+    reset_ms: float | None = None
+    step_ms: list[float] = field(default_factory=list)
+    act_ms: list[float] = field(default_factory=list)
+    policy_seconds: float = 0.0
+    latency_ms: list[float] = field(default_factory=list)
+    ticks_waited: int = 0
+    ticks_held: int = 0
+    timing_ms: dict[str, list[float]] = field(default_factory=dict)
+
+    def began(self, info: object) -> None:
+        said = info if isinstance(info, dict) else {}
+        self.checkpoint, self.weights, self.revision = (
+            value if isinstance(value := said.get(name), str) else None
+            for name in ("checkpoint", "weights", "revision")
+        )
+
+    def instructed(self, instruction: str) -> None:
+        self.earlier.append(self.instruction)
+        self.instruction = instruction
+
+    def acted(self, act: Act, seconds: float, latency_s: float | None) -> None:
+        """Record an answer of the policy, its duration and, in real-time mode, its latency."""
+        self.act_ms.append(1e3 * seconds)
+        timing = act.info.get("timing", {})
+        # Each answer counts its share of a batch; a policy in this process computes during the whole wait.
+        computed_ms = timing.get("inference_ms", 1e3 * seconds)
+        self.policy_seconds += computed_ms / 1e3 / max(1, timing.get("batch_size", 1))
+        for stage, spent in timing.items():
+            if stage.endswith("_ms"):  # the batch size is not a time
+                self.timing_ms.setdefault(stage, []).append(float(spent))
+        if (version := version_of(act)) is not None:
+            self.policy_version, self.policy_fingerprint = version, act.info[POLICY].get("fingerprint") or None
+            self.first_policy_version = version if self.first_policy_version is None else self.first_policy_version
+        if latency_s is not None:
+            self.latency_ms.append(1e3 * latency_s)
+
+    def stepped(self, tick: Tick, step: EnvStep, limit: int) -> bool:
+        """Record that `tick` was executed; return whether the episode is over, also by the `limit` of steps."""
+        self.steps += 1
+        self.ticks_waited += tick.waited
+        self.ticks_held += tick.held
+        self.actions.update(tick.action.astype(_LITTLE_ENDIAN, copy=False).tobytes())
+        self.episode_return += step.reward
+        self.success = step.success
+        if self.success and self.first_success is None:
+            self.first_success = self.steps
+        over = step.terminated or step.truncated or self.steps >= limit
+        if over:
+            self.ending = "terminated" if step.terminated else "truncated"
+        return over
+
+    def result(self, transport: str, failed: PolicyFailed | None = None) -> EpisodeResult:
+        """Return the result of the finished episode; `failed` is the policy error that ended it, if any."""
+        kept = {name: getattr(self, name) for name in _KEPT}
+        return EpisodeResult(
+            **kept,
+            status="done" if failed is None else "policy_error",
+            success_once=self.first_success is not None and failed is None,
+            success_at_end=self.success and failed is None,
+            first_success=self.first_success if failed is None else None,
+            ending=self.ending if failed is None else "error",
+            instruction="; ".join([*self.earlier, self.instruction]),
+            error=None if failed is None else f"{failed.code}: {failed}",
+            seconds=perf_counter() - self.started,
+            env_step_ms=_quantile(self.step_ms, 0.5),
+            env_seconds=((self.reset_ms or 0.0) + sum(self.step_ms)) / 1e3,
+            acts=len(self.act_ms),
+            policy_ms=_quantile(self.act_ms, 0.5),
+            policy_p95_ms=_quantile(self.act_ms, 0.95),
+            latency_ms=_quantile(self.latency_ms, 0.5),
+            timing_ms={stage: float(np.median(spent)) for stage, spent in sorted(self.timing_ms.items())},
+            transport=transport,
+            actions_sha256=self.actions.hexdigest(),
+        )
+
+
+def _quantile(milliseconds: list[float], q: float) -> float | None:
+    return float(np.quantile(milliseconds, q)) if milliseconds else None
+
 
 Phase = Literal["idle", "connect", "make", "env reset", "policy reset", "policy act", "env step"]
 Outcome = EpisodeResult | VLAgentsError
@@ -175,8 +283,8 @@ class _Episode:
         self._executor, self._done = self.new_executor(), False
 
     def request(self) -> Obs:
-        continuation, info = self._executor.request_info(), self.observer.request_info
-        return _for_policy(self.obs, {**info, **continuation} if info else continuation)
+        info = {**self.observer.request_info, **self._executor.request_info()}
+        return replace(self.obs, info={**self.obs.info, **info}) if info else self.obs
 
     def answered(self, answer: Act | Exception, contract: Contract, seconds: float) -> None:
         """Plan the next ticks from the policy's answer, which took `seconds`."""
@@ -228,30 +336,25 @@ def _instructed(env: BatchEnv, playing: Sequence[_Episode]) -> list[_Episode]:
 def _reset_policy(agent: Agent, episodes: Sequence[_Episode], contract: Contract, options: Mapping[str, Any]) -> None:
     """Reset the session of each episode with its observation, in one message to a server."""
     keys, sessions = [one.stats.key for one in episodes], [one.session for one in episodes]
-    first, texts = [_for_policy(one.obs, {}) for one in episodes], [one.stats.instruction for one in episodes]
+    first, texts = [one.obs for one in episodes], [one.stats.instruction for one in episodes]
     seeds = [key.seed if key.policy_seed is None else key.policy_seed for key in keys]
     given = {**options, "env": keys[0].env}
     if hasattr(agent, "metadata"):  # a server also compares the contract, and answers 409
         given["contract"] = contract.to_json()
-    answers: Iterable[dict[str, Any] | Exception]
+    answers: list[dict[str, Any] | Exception] = []
     if isinstance(agent, RemoteAgent):
         try:
             answers = agent.reset_batch(first, texts, sessions, seeds=seeds, **given)  # type: ignore[arg-type]
         except VLAgentsError as error:
             answers = [error] * len(episodes)
     else:
-        answers = map(partial(_reset_session, given), sessions, first, texts, seeds)
+        for session, obs, text, seed in zip(sessions, first, texts, seeds, strict=True):
+            try:
+                answers.append(session.reset(obs, text, **{**given, "seed": seed}))
+            except Exception as error:  # noqa: BLE001 - becomes the outcome of the episode
+                answers.append(error)
     for episode, answer in zip(episodes, answers, strict=True):
         episode.began(answer)
-
-
-def _reset_session(
-    given: Mapping[str, Any], session: Agent, obs: Obs, text: str, seed: int
-) -> dict[str, Any] | Exception:
-    try:
-        return session.reset(obs, text, **{**given, "seed": seed})
-    except Exception as error:  # noqa: BLE001 - becomes the outcome of the episode
-        return error
 
 
 def _request_actions(agent: Agent, episodes: Sequence[_Episode], contract: Contract) -> None:
@@ -301,7 +404,3 @@ def options_of_reset(env: Environment, episode: int, options: Mapping[str, Any] 
     """Return the options for the environment's reset: the user's `options` override the benchmark's."""
     begin = {} if env.init_states is None else {"init_state": episode % env.init_states}
     return begin | dict(options or {}) or None
-
-
-def _for_policy(obs: Obs, info: Mapping[str, Any]) -> Obs:
-    return replace(obs, info={**obs.info, **info}) if info else obs

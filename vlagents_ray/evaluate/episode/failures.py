@@ -34,8 +34,8 @@ _USER = (
     errors.UnknownApp,
     errors.UnknownCheckpoint,
 )
-_POLICY = (errors.PolicyUnavailable, errors.DeadlineExceeded, errors.UnknownSession, errors.NotReset)
 _WORKER = (errors.EnvFailed, errors.InvalidInput)  # InvalidInput here: an unusable observation of the environment
+_POLICY = (errors.UnknownSession, errors.NotReset)  # other `InvalidInput`, of the connection to the policy
 # These errors of an environment are no breakdown: they report settings, a breach of its contract, a missing package, or
 # a refused action.
 _FROM_ENV = (
@@ -65,16 +65,12 @@ class Failure:
 
 def explain(error: errors.VLAgentsError) -> Failure:
     """Return the failure for `error`. A `PolicyFailed` outside an episode means that the policy cannot start."""
-    cause: Cause
+    cause: Cause = "worker" if isinstance(error, _WORKER) and not isinstance(error, _POLICY) else "policy"
     if isinstance(error, _USER):
         cause = "user"
-    elif isinstance(error, _POLICY) or not isinstance(error, _WORKER):
-        cause = "policy"
-    else:
-        cause = "worker"
-    message = (
-        f"{error} (worker's Python: {sys.executable})" if isinstance(error, errors.MissingDependency) else str(error)
-    )
+    message = str(error)
+    if isinstance(error, errors.MissingDependency):
+        message += f" (worker's Python: {sys.executable})"
     return Failure(cause, error.code, message, "".join(traceback.format_exception(error)))
 
 

@@ -51,7 +51,9 @@ class ChunkExecutor:
         self._execute = execute
         self._real_time = clock is not None
         self._clock = _SYNCHRONOUS if clock is None else clock
-        self._hz = 0.0 if clock is None else _rate(clock, env)
+        self._hz = self._clock.hz or env.control_hz or 0.0
+        if self._real_time and not self._hz:
+            raise ConfigError("clock: got no hz, and the env's contract states no control_hz; give clock.hz, in 1/s")
         self._spec = env.action
         self._still = stopping(env.action) if self._clock.meanwhile == "chunk" else self._clock.meanwhile
         if self._clock.latency != 0 and self._clock.neutral is None and stopping(env.action) != "zero":
@@ -119,10 +121,3 @@ class ChunkExecutor:
         if self._still == "hold":
             return self._last
         return start if given is not None else SafeAction("zero", self._spec)(Obs(), self._last)
-
-
-def _rate(clock: ClockConfig, env: Contract) -> float:
-    hz = clock.hz or env.control_hz
-    if not hz:
-        raise ConfigError("clock: got no hz, and the env's contract states no control_hz; give clock.hz, in 1/s")
-    return hz

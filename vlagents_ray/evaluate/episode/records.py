@@ -65,19 +65,11 @@ class EpisodeResult:
         return {one.name: getattr(self, one.name) for one in fields(self) if one.name not in _CIRCUMSTANCES}
 
 
-_TIMES = {
-    "seconds",
-    "reset_ms",
-    "env_step_ms",
-    "env_seconds",
-    "policy_ms",
-    "policy_p95_ms",
-    "policy_seconds",
-    "timing_ms",
-}
-_POLICY = {"policy_version", "policy_fingerprint", "first_policy_version"}
 # "weights" is checked separately, and other versions of the weights show in the actions.
-_CIRCUMSTANCES = _TIMES | _POLICY | {"transport", "weights", "revision"}
+_CIRCUMSTANCES = {
+    "seconds", "reset_ms", "env_step_ms", "env_seconds", "policy_ms", "policy_p95_ms", "policy_seconds", "timing_ms",
+    "transport", "weights", "revision", "policy_version", "policy_fingerprint", "first_policy_version",
+}  # fmt: skip
 
 
 @dataclass(frozen=True, slots=True)

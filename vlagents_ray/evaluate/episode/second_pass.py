@@ -81,20 +81,17 @@ class PlayedEpisode(EpisodeObserver):
         try:
             for number, (obs, step) in enumerate(played):
                 record(obs)
-                same = step is None or (step.reward, step.success) == self._done[number - 1][1:]
-                differs = self._difference(number, obs) if same else "reward or success"
+                then, now = self._seen[number], _digests(obs)
+                parts = [(kind, name) for kind in (0, 1) for name in then[kind]]
+                differs = next((name for kind, name in parts if then[kind][name] != now[kind].get(name)), None)
+                if step is not None and (step.reward, step.success) != self._done[number - 1][1:]:
+                    differs = "reward or success"
                 if differs is not None:
                     steps = "the last step" if number == len(self._done) else f"{number} steps"
                     return f"after {steps}, {differs} differs"
         except VLAgentsError as error:  # such as an earlier end of the episode
             return str(error)
         return None
-
-    def _difference(self, number: int, obs: Obs) -> str | None:
-        """Return the part of observation `number` that is not in `obs`, or None."""
-        then, now = self._seen[number], _digests(obs)
-        parts = [(kind, name) for kind in (0, 1) for name in then[kind]]
-        return next((name for kind, name in parts if then[kind][name] != now[kind].get(name)), None)
 
 
 SecondPass = Callable[[PlayedEpisode, Callable[[Obs], None]], str | None]  # `play_again` with the environment

@@ -5,6 +5,7 @@ from __future__ import annotations
 import shutil
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import islice
 from pathlib import Path
 from typing import Any
 
@@ -21,9 +22,8 @@ from vlagents_ray.dataset_contract import (
     rotation_vector_in,
 )
 from vlagents_ray.errors import ConfigError
+from vlagents_ray.evaluate.artifacts.recorder import DEFAULT_FPS, Trajectory, videos_of
 from vlagents_ray.evaluate.artifacts.storage import link_or_copy, require_there, whole_folder
-from vlagents_ray.evaluate.artifacts.trajectory import Trajectory, videos_of
-from vlagents_ray.evaluate.artifacts.video import DEFAULT_FPS
 from vlagents_ray.evaluate.results.reader import CellResults, Episode, Results
 from vlagents_ray.naming import did_you_mean, distinct
 from vlagents_ray.registry import require
@@ -103,8 +103,38 @@ def to_lerobot(
 
     def demonstrations() -> Iterator[_Demonstration]:
         for cell, episode in recorded:
-            one = _demonstration(results, cell, episode, cameras, state, environment_state, cut_idle, with_versions)
-            if len(one.actions):  # a policy that failed before it acted leaves an empty episode
+            path = str(episode.trajectory)
+            trajectory = Trajectory.load(results.file(path))
+            parts = parts_of(trajectory.state, trajectory.gripper is not None)
+            numbers = [part for part in parts if part != GRIPPER or trajectory.gripper is None]
+            environment = _chosen("environment_state", environment_state, numbers, cell.env)
+            others = [part for part in parts if part not in environment]
+            chosen = _chosen("state", others if state is None else state, parts, cell.env)
+            shown = _chosen("cameras", cameras, trajectory.cameras, cell.env)
+            videos = videos_of(Path(path), trajectory.cameras)
+            with_gripper = trajectory.gripper is not None and GRIPPER in chosen
+            named = {*chosen, *environment} - ({GRIPPER} if with_gripper else set())
+            kept = {part: values for part, values in trajectory.state.items() if part in named}
+            gripper = trajectory.gripper if with_gripper else None
+            frames = len(trajectory.actions)
+            if cut_idle:
+                moving = [trajectory.actions, *kept.values(), *([] if gripper is None else [gripper[:, np.newaxis]])]
+                frames = _frames_until_rest(trajectory.success, moving)
+            one = _Demonstration(
+                cell,
+                episode,
+                Contract.from_json(cell.contract),
+                trajectory.actions[:frames],
+                trajectory.rewards[:frames],
+                trajectory.success[:frames],
+                tuple(chosen),
+                tuple(environment),
+                {part: values[:frames] for part, values in kept.items()},
+                None if gripper is None else gripper[:frames],
+                trajectory.versions[:frames] if with_versions else None,
+                {camera: require_there(results.file(str(videos[camera]))) for camera in shown},
+            )
+            if frames:  # a policy that failed before it acted leaves an empty episode
                 yield one
 
     angles = _angles(demonstrations())
@@ -147,50 +177,6 @@ class _Demonstration:
 
 def _fps(cell: CellResults) -> float:
     return float(cell.contract.get("control_hz") or DEFAULT_FPS)
-
-
-def _demonstration(
-    results: Results,
-    cell: CellResults,
-    episode: Episode,
-    cameras: Sequence[str] | None,
-    state: Sequence[str] | None,
-    environment_state: Sequence[str],
-    cut_idle: bool,
-    with_versions: bool,
-) -> _Demonstration:
-    path = str(episode.trajectory)
-    trajectory = Trajectory.load(results.file(path))
-    parts = parts_of(trajectory.state, trajectory.gripper is not None)
-    numbers = [part for part in parts if part != GRIPPER or trajectory.gripper is None]
-    environment = _chosen("environment_state", environment_state, numbers, cell.env)
-    if state is None:
-        state = [part for part in parts if part not in environment]
-    chosen = _chosen("state", state, parts, cell.env)
-    shown = _chosen("cameras", cameras, trajectory.cameras, cell.env)
-    videos = videos_of(Path(path), trajectory.cameras)
-    with_gripper = trajectory.gripper is not None and GRIPPER in chosen
-    named = {*chosen, *environment} - ({GRIPPER} if with_gripper else set())
-    kept = {part: values for part, values in trajectory.state.items() if part in named}
-    gripper = trajectory.gripper if with_gripper else None
-    frames = len(trajectory.actions)
-    if cut_idle:
-        moving = [trajectory.actions, *kept.values(), *([] if gripper is None else [gripper[:, np.newaxis]])]
-        frames = _frames_until_rest(trajectory.success, moving)
-    return _Demonstration(
-        cell,
-        episode,
-        Contract.from_json(cell.contract),
-        trajectory.actions[:frames],
-        trajectory.rewards[:frames],
-        trajectory.success[:frames],
-        tuple(chosen),
-        tuple(environment),
-        {part: values[:frames] for part, values in kept.items()},
-        None if gripper is None else gripper[:frames],
-        trajectory.versions[:frames] if with_versions else None,
-        {camera: require_there(results.file(str(videos[camera]))) for camera in shown},
-    )
 
 
 def _chosen(option: str, wanted: Sequence[str] | None, known: Sequence[str], env: str) -> list[str]:
@@ -247,30 +233,28 @@ def _finished(one: _Demonstration, angles: Mapping[int, Centre], folder: Path) -
     """Return the episode in the dataset's form, after putting its videos into `folder`."""
     keys = camera_keys(one.videos)
     names = {key: camera for camera, key in keys.items()}
-    about = DatasetContract(_policy_contract(one), one.parts, names, angles, one.environment)
-    rows, features = _numbers(one, about)
-    images: dict[str, Stats] = {}
-    videos: dict[str, Path] = {}
-    for camera, video in one.videos.items():
-        key = keys[camera]
-        images[key], size = _statistics(video, len(one.actions))
-        features[key] = video_feature(*size, _fps(one.cell))
-        videos[key] = folder / f"{key}.mp4"
-        link_or_copy(video, videos[key])
-    return Finished(one.episode.result.instruction, features, rows, images, videos, about)
-
-
-def _policy_contract(one: _Demonstration) -> Contract:
-    """Return the contract of a policy that is trained on the dataset: its actions are the env's, without bounds."""
-    env = one.contract
-    specs = env.state or {}
-    return Contract(
+    env, specs = one.contract, one.contract.state or {}
+    contract = Contract(  # of a policy that is trained on the dataset: its actions are the env's, without bounds
         cameras={camera: (env.cameras or {}).get(camera, CameraSpec()) for camera in one.videos},
         state={part: replace(specs.get(part, StateSpec()), dim=values.shape[1]) for part, values in one.state.items()},
         gripper=one.gripper is not None,
         action=replace(env.action, dim=one.actions.shape[1], low=None, high=None),
         control_hz=env.control_hz,
     )
+    about = DatasetContract(contract, one.parts, names, angles, one.environment)
+    rows, features = _numbers(one, about)
+    images: dict[str, Stats] = {}
+    videos: dict[str, Path] = {}
+    for camera, video in one.videos.items():
+        key, seen = keys[camera], ImageStatistics()
+        with require("av").open(str(video)) as container:
+            stream = container.streams.video[0]
+            for frame in islice(container.decode(stream), len(one.actions)):
+                seen.add(frame.to_ndarray(format="rgb24"))
+            images[key], features[key] = seen.result(), video_feature(stream.height, stream.width, _fps(one.cell))
+        videos[key] = folder / f"{key}.mp4"
+        link_or_copy(video, videos[key])
+    return Finished(one.episode.result.instruction, features, rows, images, videos, about)
 
 
 def _numbers(one: _Demonstration, about: DatasetContract) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
@@ -309,15 +293,3 @@ def _numbers(one: _Demonstration, about: DatasetContract) -> tuple[dict[str, np.
         features[key]["unit"] = getattr((one.contract.state or {}).get(part), "unit", None)
         place += width
     return rows, features
-
-
-def _statistics(video: Path, frames: int) -> tuple[Stats, tuple[int, int]]:
-    """Return the statistics of the first `frames` images, and their (height, width) in pixels."""
-    seen = ImageStatistics()
-    with require("av").open(str(video)) as container:
-        stream = container.streams.video[0]
-        for number, frame in enumerate(container.decode(stream)):
-            if number == frames:
-                break
-            seen.add(frame.to_ndarray(format="rgb24"))
-        return seen.result(), (stream.height, stream.width)

@@ -20,7 +20,7 @@ from vlagents_ray.errors import ConfigError
 from vlagents_ray.evaluate.artifacts.storage import whole_folder
 from vlagents_ray.evaluate.results.reader import CellResults, Results, have_common_rate, rate_of
 from vlagents_ray.evaluate.results.statistics import Rate
-from vlagents_ray.evaluate.results.summary import checkpoint_of, pushed_of, weights_of
+from vlagents_ray.evaluate.results.summary import pushed_of, stated
 from vlagents_ray.naming import distinct, plain
 
 Metric = Literal["success_once", "success_at_end"]
@@ -55,8 +55,17 @@ class Score:
     @property
     def deviations(self) -> list[str]:
         """The differences from the protocol or the plan, a phrase each."""
-        found = [text for cell in self.cells for text in _deviations(cell)]
-        return list(dict.fromkeys(found))
+        found: dict[str, None] = {}
+        for cell in self.cells:
+            found |= {str(one): None for one in _protocol(cell).get("deviations") or []}
+            stated = {
+                "real time: the environment does not wait for the policy": cell.settings.get("clock") is not None,
+                "the policy got JPEG images": cell.settings.get("codec") == "jpeg",
+                f"{cell.env}: stopped early, after {cell.stopped_at} of {cell.planned} episodes": cell.stopped_at,
+                f"{cell.env}: {cell.missing} of {cell.planned} planned episodes have no result": cell.missing,
+            }
+            found |= {text: None for text, holds in stated.items() if holds}
+        return list(found)
 
     @property
     def note(self) -> str:
@@ -72,19 +81,17 @@ class Score:
         protocols = [_protocol(cell) for cell in self.cells]
         named = _distinct(one.get("name") for one in protocols)
         protocol = ", ".join(named) or ("the environment's" if any(protocols) else "none stated")
-        weights = _distinct(of(cell) for of in (weights_of, pushed_of) for cell in self.cells)
-        weights = weights or _distinct(checkpoint_of(cell) for cell in self.cells) or ["no digest reported"]
+        weights = _distinct(stated(cell, "weights") for cell in self.cells) + _distinct(map(pushed_of, self.cells))
+        weights = weights or _distinct(stated(cell, "checkpoint") for cell in self.cells) or ["no digest reported"]
         errors = sum(one.status == "policy_error" for one in counted)
+        when = "some step" if self.metric == "success_once" else "the last step"
         return (
-            f"success rate in %, {_WHEN[self.metric]}; {rate.successes} of {rate.episodes} episodes, {kind} {low} to "
+            f"success rate in %, solved after {when}; {rate.successes} of {rate.episodes} episodes, {kind} {low} to "
             f"{high}; ended by an error of the policy: {errors}; seeds {seeds[0]} to {seeds[-1]}; "
             f"protocol: {protocol}; deviations: {'; '.join(odd[:_MOST_NOTED]) or 'none'}{more}; "
             f"weights: {', '.join(weights)}; "
             f"code: {', '.join(_distinct(_code(run.versions) for run in self.results.runs))}"
         )
-
-
-_WHEN = {"success_once": "solved after some step", "success_at_end": "solved after the last step"}
 
 
 def scores(results: Results) -> list[Score]:
@@ -117,19 +124,6 @@ def benchmark_of(env: str) -> str:
 def _protocol(cell: CellResults) -> dict[str, Any]:
     stated = cell.described.get("protocol")
     return dict(stated) if isinstance(stated, dict) else {}
-
-
-def _deviations(cell: CellResults) -> list[str]:
-    found = [str(one) for one in _protocol(cell).get("deviations") or []]
-    if cell.settings.get("clock") is not None:
-        found.append("real time: the environment does not wait for the policy")
-    if cell.settings.get("codec") == "jpeg":
-        found.append("the policy got JPEG images")
-    if cell.stopped_at is not None:
-        found.append(f"{cell.env}: stopped early, after {cell.stopped_at} of {cell.planned} episodes")
-    if cell.missing:
-        found.append(f"{cell.env}: {cell.missing} of {cell.planned} planned episodes have no result")
-    return found
 
 
 def _distinct(values: Iterable[Any]) -> list[str]:
@@ -192,21 +186,19 @@ def to_hub(results: Results, path: Path, **settings: Any) -> int:
     names = [one.name for one in found]
     short = [plain(name.rpartition("/")[2]) for name in names]
     ids = dict(zip(names, short, strict=True)) if len(set(short)) == len(short) else distinct(names)
-    entries = [_entry(one, given.task_id or ids[one.name], given) for one in found]
+    entries: list[dict[str, Any]] = [
+        {
+            "dataset": {"id": given.dataset, "task_id": given.task_id or ids[one.name]},
+            "value": round(100 * (one.rate.rate or 0.0), 2),
+            "date": one.date.isoformat().replace("+00:00", "Z"),
+            "notes": one.note,
+        }
+        for one in found
+    ]
+    if given.source_url is not None:
+        entries = [one | {"source": {"url": given.source_url, "name": "results by vlagents-ray"}} for one in entries]
     with whole_folder(path) as folder:
         file = folder / ".eval_results" / f"{plain(given.dataset)}.yaml"
         file.parent.mkdir()
         file.write_text(yaml.safe_dump(entries, sort_keys=False, allow_unicode=True, width=100), encoding="utf-8")
     return sum(one.rate.episodes for one in found)
-
-
-def _entry(score: Score, task: str, given: HubSettings) -> dict[str, Any]:
-    entry: dict[str, Any] = {
-        "dataset": {"id": given.dataset, "task_id": task},
-        "value": round(100 * (score.rate.rate or 0.0), 2),
-        "date": score.date.isoformat().replace("+00:00", "Z"),
-        "notes": score.note,
-    }
-    if given.source_url is not None:
-        entry["source"] = {"url": given.source_url, "name": "results by vlagents-ray"}
-    return entry

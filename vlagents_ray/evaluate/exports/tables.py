@@ -85,7 +85,9 @@ COLUMNS = (
     _of_result("transport", "string", "transport of the observations"),
     _of_episode("attempts", "integer", "1, and one more for each failure of infrastructure"),
     _of_episode("run", "integer", "number of the run over the plan, from 1"),
-    Column("finished", "time", "when it was recorded", lambda _cell, episode: _time(episode.finished)),
+    Column(
+        "finished", "time", "when it was recorded", lambda _, one: datetime.fromtimestamp(one.finished, timezone.utc)
+    ),
     _of_episode("videos", "json", "paths in the folder of results"),
     _of_episode("trajectory", "string", "path in the folder of results"),
     _of_result("revision", "string", "the hub's commit of the checkpoint, if it was loaded from the hub's cache"),
@@ -94,15 +96,12 @@ COLUMNS = (
 )  # fmt: skip
 
 
-def rows(results: Results) -> Iterator[dict[str, Any]]:
-    """Yield every recorded episode as Python values by column; those of type "json" are still nested."""
+def rows(results: Results, *, flat: bool = False) -> Iterator[dict[str, Any]]:
+    """Yield every recorded episode as Python values by column; those of type "json" are nested or, if `flat`, text."""
     for cell in results.cells:
         for episode in cell.episodes:
-            yield {column.name: column.value(cell, episode) for column in COLUMNS}
-
-
-def _time(seconds: float) -> datetime:
-    return datetime.fromtimestamp(seconds, timezone.utc)
+            row = {column.name: column.value(cell, episode) for column in COLUMNS}
+            yield row | {name: canonical(row[name]) for name in _JSON if flat}
 
 
 _JSON = {column.name for column in COLUMNS if column.type == "json"}
@@ -125,8 +124,9 @@ def to_csv(results: Results, path: Path) -> int:
     with whole(path) as part, part.open("w", encoding="utf-8", newline="") as file:
         writer = csv.DictWriter(file, [column.name for column in COLUMNS])
         writer.writeheader()
-        for number, row in enumerate(rows(results), 1):  # noqa: B007 - the last one counts
-            writer.writerow({name: _field(value, name in _JSON) for name, value in row.items()})
+        for number, row in enumerate(rows(results, flat=True), 1):  # noqa: B007 - the last one counts
+            row |= {name: str(value).lower() for name, value in row.items() if isinstance(value, bool)}
+            writer.writerow({name: _text(one) if isinstance(one, datetime) else one for name, one in row.items()})
     return number
 
 
@@ -138,9 +138,7 @@ def to_parquet(results: Results, path: Path) -> int:
         "time": pa.timestamp("us", "UTC"), "json": pa.string(),
     }  # fmt: skip
     fields = [pa.field(one.name, types[one.type], metadata={"meaning": one.meaning}) for one in COLUMNS]
-    found = [
-        {name: canonical(value) if name in _JSON else value for name, value in row.items()} for row in rows(results)
-    ]
+    found = list(rows(results, flat=True))
     with whole(path) as part:
         require("pyarrow.parquet").write_table(pa.Table.from_pylist(found, pa.schema(fields)), part)
     return len(found)
@@ -150,11 +148,3 @@ def _text(value: object) -> str:
     if isinstance(value, datetime):
         return value.isoformat()
     raise TypeError(f"{type(value).__name__} is not JSON")
-
-
-def _field(value: object, nested: bool) -> object:
-    if nested:
-        return canonical(value)
-    if isinstance(value, bool):
-        return str(value).lower()
-    return _text(value) if isinstance(value, datetime) else value

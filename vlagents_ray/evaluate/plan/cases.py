@@ -130,13 +130,14 @@ def cells(config: EvalConfig) -> list[EvalCase]:
     two equal suites, as their episodes would have the same keys; and for names that differ only in characters that file
     names cannot have, as their episodes would have the same files.
     """
-    robot = config.real_robot
-    envs = [
-        (suite, env)
-        for suite in config.suites
-        for pattern in suite.envs
-        for env in (expand(pattern) if robot is None else _tasks(robot, pattern))
-    ]
+    robot, envs = config.real_robot, []
+    for suite in config.suites:
+        for pattern in suite.envs:
+            tasks = expand(pattern) if robot is None else fnmatch.filter(robot.tasks, pattern)
+            if robot is not None and not tasks:
+                have = sorted(robot.tasks)
+                raise UnknownEnv(f"{pattern!r}: matches none of the plan's `robot.tasks`, which are {have}")
+            envs += [(suite, env) for env in tasks]
     contenders: list[tuple[PolicyConfig, int | None]] = []
     for policy in config.policies:
         alone = None if policy.pushed_weights is None else policy.pushed_weights.version
@@ -182,10 +183,4 @@ def expand(pattern: str) -> list[str]:
     known = [f"{suite}/{task}" for task in cls.tasks()]
     if not (found := fnmatch.filter(known, pattern)):
         raise UnknownEnv(f"{pattern!r}: matches none of the tasks of {suite!r}, which knows {known}")
-    return found
-
-
-def _tasks(robot: RobotConfig, pattern: str) -> list[str]:
-    if not (found := fnmatch.filter(robot.tasks, pattern)):
-        raise UnknownEnv(f"{pattern!r}: matches none of the plan's `robot.tasks`, which are {sorted(robot.tasks)}")
     return found

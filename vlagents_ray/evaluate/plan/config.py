@@ -78,9 +78,7 @@ class PolicyConfig(_PlanModel):
     @field_validator("steps", mode="before")
     @classmethod
     def _range(cls, steps: object) -> object:
-        if not isinstance(steps, dict):
-            return steps
-        return list(StepRange.model_validate(steps).steps)
+        return list(StepRange.model_validate(steps).steps) if isinstance(steps, dict) else steps
 
     @field_validator("steps")
     @classmethod
@@ -90,13 +88,9 @@ class PolicyConfig(_PlanModel):
         return steps
 
     @model_validator(mode="after")
-    def _one_kind_of_checkpoints(self) -> Self:
+    def _consistent(self) -> Self:
         if self.steps and self.pushed_weights is not None:
             raise ValueError("got steps and pushed_weights, want one of them: each names checkpoints in the results")
-        return self
-
-    @model_validator(mode="after")
-    def _not_ours(self) -> Self:
         ours = {"seed", "env", "contract"} | ({"checkpoint_step"} if self.steps else set())
         if taken := sorted(ours & self.options.keys()):
             raise ValueError(f"options: {taken} are set episode by episode; leave them out")
@@ -173,18 +167,13 @@ class SuiteConfig(_PlanModel):
         return envs
 
     @model_validator(mode="after")
-    def _measured_alone(self) -> Self:
+    def _consistent(self) -> Self:
         if self.clock is not None and self.clock.latency == "measured" and self.num_envs > 1:
             raise ValueError(
                 f"num_envs: got {self.num_envs} with a measured clock.latency, which would be that of the whole batch; "
                 f"want 1, or a latency in seconds"
             )
-        return self
-
-    @model_validator(mode="after")
-    def _apart(self) -> Self:
-        ordered = sorted(self.seeds)
-        for low, high in itertools.pairwise(ordered):
+        for low, high in itertools.pairwise(sorted(self.seeds)):
             if high - low < self.episodes:
                 raise ValueError(
                     f"seeds: {low} and {high} with {self.episodes} episodes each would play some twice; "

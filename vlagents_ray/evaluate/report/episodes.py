@@ -6,7 +6,7 @@ import base64
 import collections
 import itertools
 import os
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from urllib.parse import quote
@@ -103,29 +103,39 @@ class Gallery:
 
     def cards(self, found: Sequence[Found], most: int) -> list[Card]:
         """Return at most `most` of these episodes with a video, from tasks and policies in turns."""
-        drawn = (self._card(cell, one) for cell, one in _in_turns(found))
-        return list(itertools.islice(filter(None, drawn), most))
+        by_cell: dict[str, list[Found]] = {}
+        for cell, one in found:
+            if one.videos:
+                by_cell.setdefault(cell.cell, []).append((cell, one))
+        drawn: list[Card] = []
+        for cell, one in filter(None, itertools.chain(*itertools.zip_longest(*by_cell.values()))):
+            label = f"{cell.task}, episode {one.result.key.episode}, {cell.contender}"
+            if len(drawn) < most and (player := self.player(one.videos[0], label)) is not None:
+                drawn.append((cell, one, player))
+        return drawn
 
     def player(self, video: str, label: str) -> Player | None:
         """Return a player for `video`, a path of an episode; None if the file is missing."""
         path = self._file(video)
         if path is None:
             return None
-        frame = last_frame(path)
+        size, frame = path.stat().st_size, last_frame(path)
+        if size <= self._budget:
+            self._budget -= size
+            self.inlined += 1
+            source: str | None = data_url("video/mp4", path.read_bytes())
+        else:
+            self.linked += 1
+            source = self.link(video)
         still = None if frame is None else poster(frame)
         style = "small" if frame is not None and max(frame.shape[:2]) < SMALL else None
         tall = None if frame is None else frame.shape[0] / frame.shape[1]
-        return Player(label, self._source(video, path), still, style, tall)
+        return Player(label, source, still, style, tall)
 
     def link(self, video: str) -> str | None:
         """Return the page's link to the file; None without one."""
         path = self._file(video)
         return None if path is None else quote(Path(os.path.relpath(path, self._page.parent.resolve())).as_posix())
-
-    def _card(self, cell: CellResults, episode: Episode) -> Card | None:
-        label = f"{cell.task}, episode {episode.result.key.episode}, {cell.contender}"
-        player = self.player(episode.videos[0], label)
-        return None if player is None else (cell, episode, player)
 
     def _file(self, video: str) -> Path | None:
         try:
@@ -134,15 +144,6 @@ class Gallery:
             self.outside.add(video)
             return None
         return path if path.is_file() else None
-
-    def _source(self, video: str, path: Path) -> str | None:
-        size = path.stat().st_size
-        if size <= self._budget:
-            self._budget -= size
-            self.inlined += 1
-            return data_url("video/mp4", path.read_bytes())
-        self.linked += 1
-        return self.link(video)
 
 
 def episodes(results: Results, gallery: Gallery) -> Episodes | None:
@@ -154,7 +155,13 @@ def episodes(results: Results, gallery: Gallery) -> Episodes | None:
         return None
     solved = [(cell, one) for cell, one in found if one.counts and one.result.success_once]
     cards = gallery.cards(solved, MOST_SOLVED)
-    rows = [_row(cell, one, gallery) for cell, one in found[:MOST_LISTED]]
+    rows = []
+    for cell, one in found[:MOST_LISTED]:
+        kind = outcome(one.result)
+        words = f"({_OUTCOMES[kind]})" if one.beyond else _OUTCOMES[kind]
+        style = {"success": "good", "failure": None}.get(kind, "bad")
+        links = [(number, gallery.link(video)) for number, video in enumerate(one.videos, 1)]
+        rows.append(EpisodeRow(cell, one, words, style, [(number, link) for number, link in links if link is not None]))
     return Episodes(rows, len(found) - len(rows), all(one.counts for _, one in found), cards)
 
 
@@ -205,21 +212,3 @@ def poster(frame: np.ndarray) -> str:
 def data_url(kind: str, data: bytes) -> str:
     """Return a URL with `data` of the media type `kind`."""
     return f"data:{kind};base64,{base64.b64encode(data).decode()}"
-
-
-def _in_turns(found: Sequence[Found]) -> Iterator[Found]:
-    """Yield one episode of each cell with videos, then the second of each, and so on."""
-    by_cell: dict[str, list[Found]] = {}
-    for cell, one in found:
-        if one.videos:
-            by_cell.setdefault(cell.cell, []).append((cell, one))
-    rounds = itertools.zip_longest(*by_cell.values())
-    return (one for turn in rounds for one in turn if one is not None)
-
-
-def _row(cell: CellResults, one: Episode, gallery: Gallery) -> EpisodeRow:
-    kind = outcome(one.result)
-    words = f"({_OUTCOMES[kind]})" if one.beyond else _OUTCOMES[kind]
-    style = {"success": "good", "failure": None}.get(kind, "bad")
-    links = [(number, gallery.link(video)) for number, video in enumerate(one.videos, 1)]
-    return EpisodeRow(cell, one, words, style, [(number, link) for number, link in links if link is not None])

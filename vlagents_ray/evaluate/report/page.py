@@ -1,6 +1,6 @@
 """`report.html`: an evaluation as one self-contained page.
 
-Python computes the content: this module, `success`, `episodes` and `provenance`, with the geometry of `charts`.
+Python computes the content: this module, `success` and `episodes`, with the geometry of `charts`.
 `templates/page.html.j2` is the page, `sections.html.j2` has a macro for each of its sections, `elements.html.j2` and
 `charts.html.j2` have their common parts. `report.css` and `report.js` are written into the page.
 """
@@ -8,34 +8,27 @@ Python computes the content: this module, `success`, `episodes` and `provenance`
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cache, partial
 from importlib.resources import files
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import yaml
 from jinja2 import Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup
 
 from vlagents_ray.evaluate.artifacts.storage import storing, whole
-from vlagents_ray.evaluate.episode.records import EpisodeResult
+from vlagents_ray.evaluate.plan.config import EvalConfig
 from vlagents_ray.evaluate.report import charts
-from vlagents_ray.evaluate.report.charts import (
-    BarChart,
-    bar_chart,
-    duration,
-    interval,
-    interval_name,
-    number,
-    percent,
-    quantity,
-)
+from vlagents_ray.evaluate.report.charts import BarChart, duration, interval, number, percent, quantity
 from vlagents_ray.evaluate.report.episodes import AT_ONCE, Gallery, episodes, errors, failures
-from vlagents_ray.evaluate.report.provenance import configuration, protocol, repeat
-from vlagents_ray.evaluate.report.success import compare_all, learning_curves, real_time_gaps, success_table
-from vlagents_ray.evaluate.results.reader import Results, by_timing, rate_of
-from vlagents_ray.evaluate.results.summary import Summary, median, summarize
+from vlagents_ray.evaluate.report.success import compare_all, learning_curves, success_table, totals
+from vlagents_ray.evaluate.results.changes import Change
+from vlagents_ray.evaluate.results.comparison import clock_gaps
+from vlagents_ray.evaluate.results.reader import CellResults, Results, Run, by_timing, rate_of
+from vlagents_ray.evaluate.results.summary import Summary, median, pushed_of, stated, summarize
 
 FILE = "report.html"
 STAGES = {  # of `act.info["timing"]`, in their order
@@ -84,11 +77,17 @@ def write_report(results: Results, path: Path, *, inline: bool = False) -> Path:
 
 def report(summary: Summary, gallery: Gallery) -> str:
     """Return the page as text."""
-    results = summary.results
+    results, total = summary.results, summary.total
+    figures = [
+        _solved(summary),
+        Figure(number(total.episodes, 0), "episodes", f"of {number(total.planned, 0)} planned"),
+        Figure(number(total.steps, 0), "env steps", f"{number(summary.steps_per_second)} a second"),
+        Figure(duration(summary.wall_seconds), "wall time", f"{quantity(total.retries, 'attempt')} repeated"),
+    ]
     sections = [
         Section("Success", "success", success_table(summary)),
         Section("Comparison", "comparison", compare_all(summary)),
-        Section("Gap to the synchronous score", "real_time", real_time_gaps(summary)),
+        Section("Gap to the synchronous score", "real_time", totals(clock_gaps(results))),
         Section("Learning curve", "learning_curve", learning_curves(summary)),
         Section("Latency", "latency", latency(summary)),
         Section("Failures", "failures", failures(results, gallery)),
@@ -106,20 +105,10 @@ def report(summary: Summary, gallery: Gallery) -> str:
             policies=list(dict.fromkeys(cell.policy for cell in results.cells)),
             tasks=len({(cell.suite, cell.env) for cell in results.cells}),
             run=results.runs[-1],
-            figures=_figures(summary),
+            figures=figures,
             sections=[one for one in sections if one.view],
         )
     )
-
-
-def _figures(summary: Summary) -> list[Figure]:
-    total = summary.total
-    return [
-        _solved(summary),
-        Figure(number(total.episodes, 0), "episodes", f"of {number(total.planned, 0)} planned"),
-        Figure(number(total.steps, 0), "env steps", f"{number(summary.steps_per_second)} a second"),
-        Figure(duration(summary.wall_seconds), "wall time", f"{quantity(total.retries, 'attempt')} repeated"),
-    ]
 
 
 def _solved(summary: Summary) -> Figure:
@@ -131,7 +120,7 @@ def _solved(summary: Summary) -> Figure:
         name += f", {timing}"
     once = part.success_once
     if once.pooled:
-        return Figure(f"{percent(once)} %", name, f"{interval_name(once)} {interval(once)} %")
+        return Figure(f"{percent(once)} %", name, f"{charts.interval_name(once)} {interval(once)} %")
     cells = by_timing(summary.results.of(best))[timing]
     rates = [rate for cell in cells if (rate := rate_of([cell], "success_once")).rate is not None]
     low, high = (percent(pick(rates, key=lambda rate: rate.rate or 0.0)) for pick in (min, max))
@@ -170,7 +159,10 @@ def latency(summary: Summary) -> Latency | None:
     played = {name: counted for name, counted in by_name.items() if counted}
     if not played:
         return None
-    spent = {name: _stages(counted) for name, counted in played.items()}
+    spent: dict[str, dict[str, float]] = {}
+    for name, counted in played.items():
+        known = {stage: median(one.timing_ms.get(key) for one in counted) for key, stage in STAGES.items()}
+        spent[name] = {stage: ms for stage, ms in known.items() if ms is not None}
     timed = {name: found for name, found in spent.items() if found}
     bars = dict(list(timed.items())[:MOST_BARS])
     stages = [stage for stage in STAGES.values() if any(stage in found for found in timed.values())]
@@ -187,10 +179,116 @@ def latency(summary: Summary) -> Latency | None:
         )
         for name, counted in played.items()
     ]
-    chart = bar_chart(bars, "One act of the policy, by stage") if bars else None
+    chart = charts.bar_chart(bars, "One act of the policy, by stage") if bars else None
     return Latency(chart, stages, rows, summary.transports, len(timed))
 
 
-def _stages(episodes: Sequence[EpisodeResult]) -> dict[str, float]:
-    found = {stage: median(one.timing_ms.get(key) for one in episodes) for key, stage in STAGES.items()}
-    return {stage: spent for stage, spent in found.items() if spent is not None}
+PROTOCOL = "protocol"  # key of an env's description: the constants of its benchmark
+_SETTINGS = ("env_options", "reset_options", "clock")
+
+
+@dataclass(frozen=True, slots=True)
+class Env:
+    """Envs with equal descriptions, and their contract."""
+
+    tasks: list[str]
+    constants: Mapping[str, Any] | None  # of the benchmark
+    described: Mapping[str, Any]
+    settings: Mapping[str, Any]
+    contract: str | None  # as YAML
+
+
+@dataclass(frozen=True, slots=True)
+class Configuration:
+    """Runs, workers, versions, the metadata of each policy's server, and all settings."""
+
+    runs: tuple[Run, ...]
+    changes: list[Change]  # of files or weights, between episodes
+    programs: list[tuple[str, Mapping[str, str]]]  # (env, digests of its files)
+    checkpoints: list[tuple[str, str]]  # (policy id, checkpoint, commit, digest or version of its weights)
+    workers: list[tuple[str, str, str, str, int]]  # (host, policy, transport, renderer, workers)
+    versions: list[Mapping[str, Any]]  # of each folder
+    policies: list[tuple[str, str]]  # (name, metadata as YAML)
+    settings: list[tuple[str, str]]  # (folder, settings as YAML)
+
+
+@dataclass(frozen=True, slots=True)
+class Again:
+    """The settings of a run as a file, without policies made by Python code."""
+
+    yaml: str
+    lacks_a_policy: bool
+
+
+@dataclass(frozen=True, slots=True)
+class Repeat:
+    """The arguments of the commands that repeat the evaluation and this page."""
+
+    runs: list[Again]
+    folders: list[str]
+
+
+def protocol(results: Results) -> list[Env]:
+    """Return the description and contract of the envs; envs with the same ones are one entry."""
+    alike: dict[str, tuple[CellResults, list[str]]] = {}
+    for cell in results.cells:
+        settings = {name: cell.settings.get(name) for name in _SETTINGS}
+        same = json.dumps([cell.described, cell.contract, settings], sort_keys=True)
+        alike.setdefault(same, (cell, []))[1].append(cell.task)
+    envs = []
+    for cell, tasks in alike.values():
+        described = dict(cell.described)
+        constants = described.pop(PROTOCOL, None)
+        of_benchmark = constants if isinstance(constants, Mapping) else None
+        settings = {name: value for name in _SETTINGS if (value := cell.settings.get(name))}
+        contract = _yaml(cell.contract) if cell.contract else None
+        envs.append(Env(list(dict.fromkeys(tasks)), of_benchmark, described, settings, contract))
+    return envs
+
+
+def configuration(results: Results) -> Configuration:
+    """Return the software and the machines that made the results."""
+    named: list[tuple[str, str]] = []
+    for cell in results.cells:
+        commit = stated(cell, "revision")
+        found = (stated(cell, "checkpoint"), commit and f"commit {commit}", stated(cell, "weights"), pushed_of(cell))
+        named += [(cell.contender, one) for one in found if one is not None]
+    workers: dict[tuple[str, str, str, str], set[tuple[int, int]]] = {}
+    for one in results.workers:
+        where = (one.host, one.policy, one.transport, one.renderer or "none")
+        workers.setdefault(where, set()).add((one.run, one.pid))
+    last = _last_runs(results)
+    return Configuration(
+        results.runs,
+        results.accepted_changes,
+        list({cell.env: (cell.env, cell.program) for cell in results.cells if cell.program}.values()),
+        list(dict.fromkeys(named)),
+        [(*where, len(alike)) for where, alike in sorted(workers.items())],
+        [{name: value for name, value in run.versions.items() if value is not None} for run in last],
+        [(name, _yaml(metadata)) for name, metadata in results.policies.items()],
+        [(str(run.config.get("out")), _yaml(run.config)) for run in last],
+    )
+
+
+def repeat(results: Results) -> Repeat:
+    """Return the commands that repeat the evaluation."""
+    folders = list(dict.fromkeys(str(run.config.get("out")) for run in results.runs))
+    runs = []
+    for run in _last_runs(results):  # without addresses of policies that were served for the run
+        config = EvalConfig.model_validate(run.config)
+        document = config.model_dump(mode="json", exclude_defaults=True, exclude={"out", "resume", "accept_changes"})
+        for policy in document["policies"]:
+            if policy.get("source") is not None:
+                policy.pop("url", None)
+        lacks_a_policy = any(not {"source", "url"} & policy.keys() for policy in document["policies"])
+        runs.append(Again(_yaml(document), lacks_a_policy))
+    return Repeat(runs, folders)
+
+
+def _last_runs(results: Results) -> list[Run]:
+    """Return the last run of each folder; earlier runs had the same settings, as far as results depend on them."""
+    return list({run.config.get("out"): run for run in results.runs}.values())
+
+
+def _yaml(value: Any) -> str:
+    return str(yaml.safe_dump(value, sort_keys=False, allow_unicode=True, width=100)).rstrip()

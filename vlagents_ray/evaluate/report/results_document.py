@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import time
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -13,7 +14,7 @@ from vlagents_ray.evaluate.episode.failures import Failure
 from vlagents_ray.evaluate.episode.records import EpisodeResult
 from vlagents_ray.evaluate.plan.cases import EvalCase
 from vlagents_ray.evaluate.plan.jobs import Job
-from vlagents_ray.evaluate.report.progress import Progress, seconds_left
+from vlagents_ray.evaluate.report.terminal import Progress, seconds_left
 from vlagents_ray.evaluate.results.database import FILE, RUNNING
 from vlagents_ray.evaluate.results.reader import CellResults, Episode, Results, rate_of
 from vlagents_ray.evaluate.results.statistics import Rate
@@ -41,8 +42,7 @@ class ResultsDocument:
     def __init__(self, out: Path) -> None:
         """Describe the results in the folder `out`, which need not exist yet."""
         self._out = out
-        self._videos: list[str] = []  # paths of the videos by their number
-        self._numbers: dict[str, int] = {}  # the reverse
+        self._numbers: dict[str, int] = {}  # of the videos by their paths, in their order
         self._document: dict[str, Any] = {}
         self._read_at, self._took_s = float("-inf"), 0.0
 
@@ -61,10 +61,10 @@ class ResultsDocument:
 
     def video(self, number: int) -> Path | None:
         """Return the file of a video in the document; None if there is none, or it is a link out of the folder."""
-        if not 0 <= number < len(self._videos):
+        if not 0 <= number < len(self._numbers):
             return None
         try:
-            path = inside(self._out, self._videos[number])
+            path = inside(self._out, list(self._numbers)[number])
         except ConfigError:
             return None
         return path if path.is_file() else None
@@ -77,21 +77,28 @@ class ResultsDocument:
         """Return the state of the evaluation: "starting", or that of its last run."""
         return results.runs[-1].state if results is not None and results.runs else STARTING
 
-    def results(self) -> Results | None:
-        """Return the results as they are now; None if there are none yet."""
-        try:
-            return Results.load(self._out) if (self._out / FILE).is_file() else None
-        except ConfigError:  # the file is being made
-            return None
-
     def _describe(self) -> dict[str, Any]:
-        results = self.results()
+        results = None
+        with contextlib.suppress(ConfigError):  # the file is being made
+            results = Results.load(self._out) if (self._out / FILE).is_file() else None
         state = self.state(results)
         cells = () if results is None else results.cells
         contenders = [] if results is None else results.contenders
-        left_s = _left_s(results) if results is not None and state == RUNNING else None
+        left_s = None
+        if results is not None and state == RUNNING:
+            run = results.runs[-1]
+            played = sum(one.run == run.run for cell in cells for one in cell.episodes)
+            left = sum(_planned(cell) - _done(cell) for cell in cells)
+            left_s = seconds_left(left, played, time.time() - run.started)
         failed = [(cell, one) for cell in cells for one in cell.episodes if not (one.beyond or one.result.success_once)]
         failed.sort(key=lambda found: found[1].finished, reverse=True)
+        curves: dict[str, list[dict[str, Any]]] = {}  # the success rate at each step or version of a policy
+        for contender in contenders:
+            mine = [cell for cell in cells if cell.contender == contender]
+            if mine[0].step is not None:
+                whole = all(_done(cell) == _planned(cell) for cell in mine)
+                point = {"step": mine[0].step, "whole": whole} | _rate(rate_of(mine, "success_once"))
+                curves.setdefault(mine[0].policy, []).append(point)
         return {
             "name": self._out.name,
             "state": state,
@@ -103,8 +110,13 @@ class ResultsDocument:
             "done": sum(_done(cell) for cell in cells),
             "planned": sum(_planned(cell) for cell in cells),
             "retries": sum(attempt.retried for cell in cells for attempt in cell.attempts),
-            "cells": [_cell(cell) for cell in cells],
-            "curves": [] if results is None else _curves(results),
+            "cells": [
+                {"policy": cell.contender, "task": cell.task, "done": _done(cell), "planned": _planned(cell)}
+                | {"stopped": cell.stopped_at is not None, "sequence": cell.stop is not None}
+                | _rate(rate_of([cell], "success_once"))
+                for cell in cells
+            ],
+            "curves": [{"policy": policy, "points": points} for policy, points in curves.items()],
             "failed": len(failed),
             "failures": [self._failure(cell, one) for cell, one in failed[:_FAILURES]],
         }
@@ -122,22 +134,8 @@ class ResultsDocument:
             "instruction": result.instruction[:_TEXT],
             "steps": result.steps,
             "finished": one.finished,
-            "videos": [self._number(video) for video in one.videos],
+            "videos": [self._numbers.setdefault(video, len(self._numbers)) for video in one.videos],
         }
-
-    def _number(self, video: str) -> int:
-        if video not in self._numbers:
-            self._numbers[video] = len(self._videos)
-            self._videos.append(video)
-        return self._numbers[video]
-
-
-def _left_s(results: Results) -> float | None:
-    """Return the remaining time of the last run, s, if episodes take as long as its earlier ones."""
-    run = results.runs[-1]
-    played = sum(one.run == run.run for cell in results.cells for one in cell.episodes)
-    left = sum(_planned(cell) - _done(cell) for cell in results.cells)
-    return seconds_left(left, played, time.time() - run.started)
 
 
 def _done(cell: CellResults) -> int:
@@ -149,27 +147,9 @@ def _planned(cell: CellResults) -> int:
     return cell.planned if cell.stopped_at is None else _done(cell)
 
 
-def _cell(cell: CellResults) -> dict[str, Any]:
-    counts = {"policy": cell.contender, "task": cell.task, "done": _done(cell), "planned": _planned(cell)}
-    stopped = {"stopped": cell.stopped_at is not None, "sequence": cell.stop is not None}
-    return counts | stopped | _rate(rate_of([cell], "success_once"))
-
-
 def _rate(rate: Rate) -> dict[str, Any]:
     low, high = rate.interval
     return {"successes": rate.successes, "episodes": rate.episodes, "rate": rate.rate, "low": low, "high": high}
-
-
-def _curves(results: Results) -> list[dict[str, Any]]:
-    """Return the learning curve of each policy that has several steps or versions: its success rate at each."""
-    points: dict[str, list[dict[str, Any]]] = {}
-    for contender in results.contenders:
-        cells = results.of(contender)
-        if cells[0].step is not None:
-            whole = all(_done(cell) == _planned(cell) for cell in cells)
-            point = {"step": cells[0].step, "whole": whole} | _rate(rate_of(cells, "success_once"))
-            points.setdefault(cells[0].policy, []).append(point)
-    return [{"policy": policy, "points": found} for policy, found in points.items()]
 
 
 class ProgressDocument(ResultsDocument, Progress):

@@ -7,7 +7,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 from vlagents_ray.evaluate.report.charts import Glyph, RateChart, Series, difference_glyph, rate_chart
-from vlagents_ray.evaluate.results.comparison import Comparison, Line, clock_gaps, comparable, comparisons
+from vlagents_ray.evaluate.results.comparison import Comparison, Line, comparable, comparisons
 from vlagents_ray.evaluate.results.reader import CellResults, Results, by_timing
 from vlagents_ray.evaluate.results.statistics import ERROR_RATE, Pairs, Rate
 from vlagents_ray.evaluate.results.summary import TOTAL, Group, Summary, group_of
@@ -202,16 +202,12 @@ def compare_all(summary: Summary) -> Comparisons | None:
         found = comparisons(results, [*asked, *(one for one in _later_first(results, pairs) if one not in asked)])
         shown, folded = (found, []) if len(found) <= MOST_PAIRS else (found[: len(asked)], found[len(asked) :])
         by_suite = [[_difference(one, line) for line in one.suites] for one in shown if one.suites]
-        parts.append(ComparisonPart(timing, _totals(shown), by_suite, _totals(folded)))
+        parts.append(ComparisonPart(timing, totals(shown), by_suite, totals(folded)))
     return Comparisons(parts, left_out, len(timings) > 1, reasons)
 
 
-def real_time_gaps(summary: Summary) -> list[Difference]:
-    """Return the differences of real time (A) and synchronous play (B); empty without such suites."""
-    return _totals(clock_gaps(summary.results))
-
-
-def _totals(found: Sequence[Comparison]) -> list[Difference]:
+def totals(found: Sequence[Comparison]) -> list[Difference]:
+    """Return the differences on all suites together."""
     return [_difference(one, one.total) for one in found]
 
 

@@ -1,23 +1,222 @@
-"""The table of results at the end of an evaluation."""
+"""An evaluation on a terminal: its progress, live or in plain lines, and the table of results at its end."""
 
 from __future__ import annotations
 
+import datetime
+from collections.abc import Mapping, Sequence
+from time import monotonic
+
 from rich.box import SIMPLE_HEAD
 from rich.console import Console
+from rich.console import Group as Rows
+from rich.live import Live
 from rich.table import Table
 from rich.text import Text
 
+from vlagents_ray.evaluate.episode.failures import Failure
+from vlagents_ray.evaluate.episode.records import EpisodeResult
+from vlagents_ray.evaluate.plan.cases import EvalCase
+from vlagents_ray.evaluate.plan.jobs import Job
 from vlagents_ray.evaluate.report.page import FILE as REPORT
-from vlagents_ray.evaluate.results.comparison import Comparison, clock_gaps
+from vlagents_ray.evaluate.results.comparison import clock_gaps
 from vlagents_ray.evaluate.results.database import RUNNING
-from vlagents_ray.evaluate.results.summary import Group, Summary, errors_of_policies, pushed_of
+from vlagents_ray.evaluate.results.statistics import Rate, confidence_sequence
+from vlagents_ray.evaluate.results.summary import Group, Summary, cause_of, errors_of_policies, pushed_of
+
+LINE_EVERY_S = 5.0
+MOST_ROWS = 12
+
+
+class Progress:
+    """The callbacks of a running evaluation, from one thread. This class shows nothing: override some.
+
+    The classes of `progress_for` show them: live on a terminal, in plain lines elsewhere.
+    """
+
+    def begin(self, cells: Sequence[EvalCase], recorded: Mapping[str, Rate], left: int) -> None:
+        """Note that the evaluation begins.
+
+        Args:
+            cells: All planned cells.
+            recorded: The success rates of earlier runs, by the cell's fingerprint.
+            left: The number of episodes to be played.
+        """
+
+    def episode(self, cell: EvalCase, result: EpisodeResult) -> None:
+        """Note that an episode was recorded.
+
+        Args:
+            cell: The cell that it belongs to.
+            result: Its result.
+        """
+
+    def retry(self, job: Job, failure: Failure) -> None:
+        """Note that an attempt failed by infrastructure; the episode will be played again.
+
+        Args:
+            job: The episode.
+            failure: The failure.
+        """
+
+    def stopped(self, cell: EvalCase, at: int, spared: int) -> None:
+        """Note that a cell stopped early.
+
+        Args:
+            cell: The cell.
+            at: The number of played episodes.
+            spared: The number of episodes that will not be played.
+        """
+
+    def end(self) -> None:
+        """Note that the evaluation has ended; no call follows."""
+
+
+class _CountedProgress(Progress):
+    """Counts for both displays, and prints errors and retries as lines."""
+
+    def __init__(self, console: Console) -> None:
+        self._console = console
+        _CountedProgress.begin(self, [], {}, 0)
+
+    def begin(self, cells: Sequence[EvalCase], recorded: Mapping[str, Rate], left: int) -> None:
+        self._started = monotonic()
+        self._cells = {cell.fingerprint: cell for cell in cells}
+        self._rates = {cell: recorded.get(cell, Rate(0, 0)) for cell in self._cells}
+        self._infra_failed = dict.fromkeys(self._cells, 0)
+        self._steps = 0
+        self._played = 0  # in this run
+        self._left = left
+        self._retries = 0
+        self._causes: set[tuple[str, str]] = set()  # (policy id, cause) of errors that were shown
+        self._alone = len({cell.contender for cell in cells}) == 1
+
+    def episode(self, cell: EvalCase, result: EpisodeResult) -> None:
+        self._played += 1
+        self._left -= 1
+        self._steps += result.steps
+        if result.status == "infra_failed":
+            self._infra_failed[cell.fingerprint] += 1
+            return
+        before = self._rates[cell.fingerprint]
+        successes, episodes = before.successes + bool(result.success_once), before.episodes + 1
+        error_rate = before.error_rate  # of a cell that may stop early
+        bounds = None if error_rate is None else confidence_sequence(successes, episodes, error_rate)
+        self._rates[cell.fingerprint] = Rate(successes, episodes, bounds, error_rate)
+        if result.status == "policy_error":
+            error = (result.error or "").strip().partition("\n")[0]
+            cause = cell.contender, cause_of(error)
+            if cause not in self._causes:
+                self._causes.add(cause)
+                where = f"{cell.contender} failed in {cell.env} episode {result.key.episode}"
+                self._print(f"{where}, counted as no success: {error}")
+
+    def retry(self, job: Job, failure: Failure) -> None:
+        self._retries += 1
+        first_line = failure.message.strip().partition("\n")[0]
+        attempt = f"{job.key.env} episode {job.key.episode}: attempt {job.attempt}"
+        self._print(f"{attempt} failed, trying again: {first_line}")
+
+    def stopped(self, cell: EvalCase, at: int, spared: int) -> None:
+        self._left -= spared
+        name = " ".join(filter(None, cell.name))
+        self._print(f"{name}: certain enough, stopped after {at} of {cell.planned} episodes")
+
+    def _print(self, text: str) -> None:
+        self._console.print(text, markup=False, highlight=False, soft_wrap=not self._console.is_terminal)
+
+    def _rows(self) -> list[tuple[str, str, str]]:
+        """Return (name, "done/planned", success so far), of many cells only for those being played."""
+        done = {cell: self._rates[cell].episodes + self._infra_failed[cell] for cell in self._cells}
+        cells = list(self._cells)
+        if len(cells) > MOST_ROWS:
+            cells = [cell for cell in cells if 0 < done[cell] < self._cells[cell].planned][:MOST_ROWS]
+        rows = []
+        for cell in cells:
+            name = " ".join(filter(None, self._cells[cell].name[self._alone :]))  # of one policy, without its id
+            rows.append((name, f"{done[cell]}/{self._cells[cell].planned}", str(self._rates[cell])))
+        return rows
+
+    def _overall(self) -> str:
+        elapsed_s = monotonic() - self._started
+        parts = ["waiting for the first episode"]
+        if self._played:
+            parts = [f"{self._steps / elapsed_s:.0f} steps/s"]
+            if (left_s := seconds_left(self._left, self._played, elapsed_s)) is not None:
+                parts.append(f"{datetime.timedelta(seconds=round(left_s))} left")
+        if self._retries:
+            parts.append(f"{self._retries} infrastructure {'retry' if self._retries == 1 else 'retries'}")
+        if any(self._infra_failed.values()):
+            parts.append(f"{sum(self._infra_failed.values())} infrastructure failures")
+        return " · ".join(parts)
+
+
+class LiveProgress(_CountedProgress):
+    """Updates a table on a terminal, with errors and retries above it."""
+
+    def __init__(self, console: Console) -> None:
+        super().__init__(console)
+        self._live = Live(console=console, auto_refresh=True, refresh_per_second=4, get_renderable=self._drawing)
+
+    def begin(self, cells: Sequence[EvalCase], recorded: Mapping[str, Rate], left: int) -> None:
+        super().begin(cells, recorded, left)
+        self._live.start()
+
+    def end(self) -> None:
+        self._live.stop()  # the last state stays on the terminal
+
+    def _drawing(self) -> Rows:
+        table = Table(box=None)
+        for title in ("env", "episodes", "success so far"):
+            table.add_column(title)
+        for row in self._rows():
+            table.add_row(*row)
+        return Rows(table, Text(self._overall()))
+
+
+class LineProgress(_CountedProgress):
+    """Prints a line every few seconds, for logs."""
+
+    def __init__(self, console: Console, every_s: float = LINE_EVERY_S) -> None:
+        super().__init__(console)
+        self._every_s = every_s
+        self._last = 0.0
+
+    def begin(self, cells: Sequence[EvalCase], recorded: Mapping[str, Rate], left: int) -> None:
+        super().begin(cells, recorded, left)
+        self._print_state()
+
+    def episode(self, cell: EvalCase, result: EpisodeResult) -> None:
+        super().episode(cell, result)
+        if monotonic() - self._last >= self._every_s:
+            self._print_state()
+
+    def end(self) -> None:
+        self._print_state()
+
+    def _print_state(self) -> None:
+        self._last = monotonic()
+        envs = " · ".join(f"{env} {done}, success {rate}" for env, done, rate in self._rows())
+        self._print(f"{envs} · {self._overall()}")
+
+
+def progress_for(console: Console) -> Progress:
+    """Choose the display for `console`: a live table on a terminal, else a line every five seconds."""
+    return LiveProgress(console) if console.is_terminal else LineProgress(console)
+
+
+def seconds_left(episodes: int, played: int, elapsed_s: float) -> float | None:
+    """Estimate the time of `episodes` further episodes, s; None if none are left or none was played."""
+    return episodes * elapsed_s / played if episodes > 0 and played else None
 
 
 def results_table(summary: Summary) -> Table:
     """Make a table of success, length and speed: for each policy id a row for each env, and one for all together."""
-    names = summary.results.contenders
+    names, error_rate = summary.results.contenders, summary.total.success_once.error_rate
+    interval = "the Wilson 95 % interval"
+    if error_rate is not None:
+        interval = f"the confidence sequence of early stopping (error rate {error_rate:.2g})"
     table = Table(
-        title=f"{', '.join(names)}: success in %, with {_interval(summary.total)}",
+        title=f"{', '.join(names)}: success in %, with {interval}",
         box=SIMPLE_HEAD,
         padding=0,
         pad_edge=False,
@@ -45,9 +244,15 @@ def print_summary(console: Console, summary: Summary) -> None:
         summary: The result of `evaluate`.
     """
     console.print(results_table(summary))
-    if summary.total.policy_errors:
-        console.print(_errors_table(summary))
     total = summary.total
+    if total.policy_errors:
+        table = Table(title="Errors of policies", box=SIMPLE_HEAD, padding=0, pad_edge=False)
+        for title in ("policy", "env", "error"):
+            table.add_column(title, overflow="fold")
+        table.add_column("episodes", justify="right", no_wrap=True)
+        for (policy, task, error), number in errors_of_policies(summary.results):
+            table.add_row(policy, task, Text(error.strip().partition("\n")[0]), str(number))
+        console.print(table)
     speed = summary.rollout_steps_per_second
     lines = [f"{total.steps} steps in {summary.wall_seconds:.1f} s"]
     if speed is not None:
@@ -66,58 +271,29 @@ def print_summary(console: Console, summary: Summary) -> None:
     lines += [f"accepted change: {change}" for change in summary.results.accepted_changes]
     pushed = {cell.contender: words for cell in summary.results.cells if (words := pushed_of(cell)) is not None}
     lines += [f"{name}: weights pushed by a learner, {words}" for name, words in pushed.items()]
-    lines += [_stopped(group) for group in summary.cells if group.stopped]
+    for one in (group for group in summary.cells if group.stopped):
+        name, error_rate = " ".join(filter(None, (one.contender, one.suite, one.env))), one.success_once.error_rate or 0
+        lines.append(f"{name}: stopped after {one.episodes} of {one.planned} (error rate {100 * error_rate:.2g} %)")
     parts = [part for name in summary.results.contenders for part in summary.parts(name).values()]
     if not all(part.success_once.pooled for part in parts):
         lines.append("cells that stopped after different numbers of episodes have no rate in common: quote each alone")
-    lines += [_gap(one) for one in clock_gaps(summary.results)]
-    if summary.state == RUNNING:
-        lines.append("still running")
-    elif summary.state != "complete":
-        lines.append(f"{summary.state}: go on with --resume")
+    for gap in clock_gaps(summary.results):  # as in the report, on the episodes of both clocks
+        counted = [one for cell in gap.cells for one in cell.counted]
+        steps = max(1, sum(one.steps for one in counted))  # 0 if the policy failed before the first step of each
+        waited, held = (sum(getattr(one, what) for one in counted) for what in ("ticks_waited", "ticks_held"))
+        low, high = gap.total.interval
+        lines.append(
+            f"{gap.a}: {100 * (gap.total.pairs.difference or 0):+.1f} points to the synchronous score "
+            f"({100 * low:+.1f} to {100 * high:+.1f}, {gap.total.pairs.total} pairs); "
+            f"{waited / steps:.0%} of its ticks waited for an answer, {held / steps:.0%} with nothing to execute"
+        )
+    if summary.state != "complete":
+        lines.append("still running" if summary.state == RUNNING else f"{summary.state}: go on with --resume")
     lines.append(f"results: {summary.out}")
-    if (summary.out / REPORT).is_file():
-        lines.append(f"report: {summary.out / REPORT}")
-    if (summary.out / "videos").is_dir():
-        lines.append(f"videos: {summary.out / 'videos'}")
+    written = {"report": summary.out / REPORT, "videos": summary.out / "videos"}
+    lines += [f"{name}: {path}" for name, path in written.items() if path.exists()]
     for line in lines:
         console.print(line, markup=False, highlight=False, soft_wrap=True)
-
-
-def _errors_table(summary: Summary) -> Table:
-    table = Table(title="Errors of policies", box=SIMPLE_HEAD, padding=0, pad_edge=False)
-    for title in ("policy", "env", "error"):
-        table.add_column(title, overflow="fold")
-    table.add_column("episodes", justify="right", no_wrap=True)
-    for (policy, task, error), number in errors_of_policies(summary.results):
-        table.add_row(policy, task, Text(error.strip().partition("\n")[0]), str(number))
-    return table
-
-
-def _interval(total: Group) -> str:
-    error_rate = total.success_once.error_rate
-    if error_rate is None:
-        return "the Wilson 95 % interval"
-    return f"the confidence sequence of early stopping (error rate {error_rate:.2g})"
-
-
-def _stopped(group: Group) -> str:
-    name = " ".join(filter(None, (group.contender, group.suite, group.env)))
-    error_rate = group.success_once.error_rate
-    return f"{name}: stopped after {group.episodes} of {group.planned} (error rate {100 * (error_rate or 0):.2g} %)"
-
-
-def _gap(gap: Comparison) -> str:
-    """Return the gap to the synchronous score, as in the report: on the episodes of both clocks."""
-    played = [one for cell in gap.cells for one in cell.counted]
-    steps = max(1, sum(one.steps for one in played))  # 0 if the policy failed before the first step of each
-    waited, held = (sum(getattr(one, what) for one in played) for what in ("ticks_waited", "ticks_held"))
-    low, high = gap.total.interval
-    return (
-        f"{gap.a}: {100 * (gap.total.pairs.difference or 0):+.1f} points to the synchronous score "
-        f"({100 * low:+.1f} to {100 * high:+.1f}, {gap.total.pairs.total} pairs); "
-        f"{waited / steps:.0%} of its ticks waited for an answer, {held / steps:.0%} with nothing to execute"
-    )
 
 
 def _cells(group: Group, timing: str) -> list[str]:

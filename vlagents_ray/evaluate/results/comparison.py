@@ -153,7 +153,7 @@ def _by_suite(results: Results, a: str, b: str) -> dict[str, Strata]:
 
 
 def _require_same_env(cell: CellResults, other: CellResults) -> None:
-    one, two = _of_env(cell), _of_env(other)
+    one, two = ({k: value for k, value in each.settings.items() if k not in OF_POLICY} for each in (cell, other))
     for name in sorted(one.keys() | two.keys()):
         if one.get(name) != two.get(name):
             raise ConfigError(
@@ -171,10 +171,6 @@ def _require_same_env(cell: CellResults, other: CellResults) -> None:
             f"compare: episodes of {cell.contender!r} and {other.contender!r} in {cell.env!r} were played with "
             f"{len(programs)} versions of its files, as --accept-changes allowed; evaluate both again in a new folder"
         )
-
-
-def _of_env(cell: CellResults) -> dict[str, Any]:
-    return {name: value for name, value in cell.settings.items() if name not in OF_POLICY}
 
 
 def _pairs(a: CellResults, b: CellResults) -> Pairs:

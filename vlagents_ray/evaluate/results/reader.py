@@ -13,14 +13,13 @@ from typing import Any, Literal
 
 from vlagents_ray.errors import ConfigError
 from vlagents_ray.evaluate.artifacts.storage import inside, require_below
-from vlagents_ray.evaluate.episode.records import EpisodeResult
+from vlagents_ray.evaluate.episode.records import EpisodeResult, WorkerInfo
 from vlagents_ray.evaluate.plan.cases import contender
 from vlagents_ray.evaluate.plan.config import StopConfig
 from vlagents_ray.evaluate.plan.jobs import EpisodeKey
 from vlagents_ray.evaluate.results.changes import Change
 from vlagents_ray.evaluate.results.database import FILE, RUNNING, is_locked, read_only, require_readable
-from vlagents_ray.evaluate.results.statistics import Rate
-from vlagents_ray.evaluate.results.stopping import Stopping, pooled
+from vlagents_ray.evaluate.results.statistics import Rate, Stopping, place_in_plan, pooled
 
 KILLED = "killed"  # the state of a run that ended without saying so
 
@@ -63,17 +62,11 @@ class Attempt:
 
 
 @dataclass(frozen=True, slots=True)
-class Worker:
+class Worker(WorkerInfo):
     """A worker's connection to a policy or creation of an env; a worker may have several entries."""
 
     run: int
     at: float  # seconds since 1970
-    host: str
-    node: str | None  # Ray's id
-    pid: int
-    policy: str
-    transport: str
-    renderer: str | None  # of its env
 
 
 @dataclass(frozen=True, slots=True)
@@ -168,7 +161,11 @@ class Results:
             attempts: dict[str, list[Attempt]] = {}
             for row in table(db, "attempts"):
                 attempts.setdefault(row["cell"], []).append(Attempt(**row | {"retried": bool(row["retried"])}))
-            runs = [_run(row) for row in table(db, "runs")]
+            runs = []
+            for row in table(db, "runs"):
+                parsed = {name: json.loads(row[name]) for name in ("config", "versions")}
+                changes = tuple(Change(**one) for one in json.loads(row["changes"] or "[]"))
+                runs.append(Run(**row | parsed | {"changes": changes}))
             written = written or is_locked(out)  # it may have begun by now
             return cls(
                 out,
@@ -271,7 +268,8 @@ def _cell(row: dict[str, Any], episodes: tuple[Episode, ...], attempts: tuple[At
     names = ("settings", "described", "contract", "code", "program")
     parsed = {name: json.loads(row[name] or "{}") for name in names}
     each = row["planned"] // len(seeds)
-    episodes = tuple(replace(one, beyond=not _is_planned(one.result.key, seeds, each)) for one in episodes)
+    # After a resumption with fewer episodes, the others that were already played would be a biased selection.
+    episodes = tuple(replace(one, beyond=place_in_plan(one.result.key, seeds, each) is None) for one in episodes)
     stop, stopped_at = None, None
     if rule is not None:
         stop = StopConfig.model_validate_json(rule)
@@ -280,19 +278,6 @@ def _cell(row: dict[str, Any], episodes: tuple[Episode, ...], attempts: tuple[At
         stopped_at = stopping.at
         episodes = tuple(replace(one, beyond=one.beyond or not stopping.counts(one.result.key)) for one in episodes)
     return CellResults(**row | parsed, episodes=episodes, attempts=attempts, stop=stop, stopped_at=stopped_at)
-
-
-def _is_planned(key: EpisodeKey, seeds: Sequence[int], each: int) -> bool:
-    """Return whether an episode is still planned.
-
-    After a resumption with fewer episodes, the others that were already played would be a biased selection.
-    """
-    return key.episode < each and key.seed - key.episode in seeds
-
-
-def _run(row: dict[str, Any]) -> Run:
-    changes = tuple(Change(**one) for one in json.loads(row["changes"] or "[]"))
-    return Run(**row | {name: json.loads(row[name]) for name in ("config", "versions")} | {"changes": changes})
 
 
 def rate_of(cells: Sequence[CellResults], what: Literal["success_once", "success_at_end"]) -> Rate:

@@ -11,6 +11,7 @@ import os
 import sqlite3
 import time
 from collections.abc import Hashable, Sequence
+from contextlib import AbstractContextManager
 from dataclasses import asdict
 from typing import Any
 
@@ -22,9 +23,9 @@ from vlagents_ray.evaluate.plan.cases import EvalCase, cells
 from vlagents_ray.evaluate.plan.config import EvalConfig, canonical
 from vlagents_ray.evaluate.plan.jobs import Job
 from vlagents_ray.evaluate.results.changes import (
-    IDENTITY,
     MIX,
     Change,
+    changed,
     listed,
     policy_changes,
     policy_program,
@@ -43,8 +44,8 @@ from vlagents_ray.evaluate.results.database import (
 )
 
 
-class Store:
-    """The results of one `out` folder, open for one evaluation at a time. Use as a context manager."""
+class Store(AbstractContextManager["Store"]):
+    """The results of one `out` folder, open for one evaluation at a time."""
 
     def __init__(self, config: EvalConfig) -> None:
         """Open or begin the results in `config.out`.
@@ -55,7 +56,6 @@ class Store:
             StorageFailed: The folder cannot be written to.
         """
         self.cells = cells(config)
-        self._pushed = {cell.fingerprint: cell.policy.pushed_weights for cell in self.cells}
         self._out = config.out
         with storing(config.out):
             self._out.mkdir(parents=True, exist_ok=True)
@@ -74,9 +74,6 @@ class Store:
         except BaseException:
             os.close(self._lock)
             raise
-
-    def __enter__(self) -> Store:
-        return self
 
     def __exit__(self, *exc: object) -> None:
         self.close()
@@ -120,8 +117,23 @@ class Store:
         by other weights of the same name, or by other weights than the pushed ones of its cell: a rate has one
         checkpoint.
         """
-        self._require_pushed_weights(result)
-        self._require_same_checkpoint(result)
+        cell = self._cell[result.key.settings]
+        want = cell.policy.pushed_weights
+        acted = (result.first_policy_version, result.policy_version, result.policy_fingerprint)
+        if want and result.policy_version is not None and acted != (want.version, want.version, want.fingerprint):
+            raise WeightsLost(
+                f"policy: {result.key} was played by versions {acted[0]} to {acted[1]} of the weights ({acted[2]}), "
+                f"want {want.version} ({want.fingerprint}); push nothing while a version is evaluated, and let the "
+                f"policy's `options` ask for no other"
+            )
+        known = self._db.execute(
+            "SELECT checkpoint FROM episodes WHERE cell = ? AND checkpoint IS NOT NULL LIMIT 1", (result.key.settings,)
+        ).fetchone()
+        if known is not None and result.checkpoint not in (None, known[0]):
+            raise ConfigError(
+                f"policy: {result.key} was played by checkpoint {result.checkpoint!r}, the results in {self._out} "
+                f"are of {known[0]!r}; serve that one again, or choose another out folder"
+            )
         self._require_same_weights(result)
         row = asdict(result)
         key = row.pop("key")
@@ -133,8 +145,8 @@ class Store:
             "timing_ms": canonical(result.timing_ms),
             "videos": canonical(list(videos)),
             "trajectory": trajectory,
-            "env_program": program_id(self._cell[result.key.settings].program),
-            "policy_program": self._policy_programs.get(self._cell[result.key.settings].policy.name),
+            "env_program": program_id(cell.program),
+            "policy_program": self._policy_programs.get(cell.policy.name),
             "attempts": attempts,
             "run": self._run,
             "finished": time.time() if finished is None else finished,
@@ -142,28 +154,6 @@ class Store:
         with self._db:
             self._db.execute("DELETE FROM episodes WHERE key = ? AND status = 'infra_failed'", (row["key"],))
             insert(self._db, "episodes", row)
-
-    def _require_pushed_weights(self, result: EpisodeResult) -> None:
-        want = self._pushed.get(result.key.settings)
-        if want is None or result.policy_version is None:
-            return
-        acted = (result.first_policy_version, result.policy_version, result.policy_fingerprint)
-        if acted != (want.version, want.version, want.fingerprint):
-            raise WeightsLost(
-                f"policy: {result.key} was played by versions {acted[0]} to {acted[1]} of the weights ({acted[2]}), "
-                f"want {want.version} ({want.fingerprint}); push nothing while a version is evaluated, and let the "
-                f"policy's `options` ask for no other"
-            )
-
-    def _require_same_checkpoint(self, result: EpisodeResult) -> None:
-        known = self._db.execute(
-            "SELECT checkpoint FROM episodes WHERE cell = ? AND checkpoint IS NOT NULL LIMIT 1", (result.key.settings,)
-        ).fetchone()
-        if known is not None and result.checkpoint not in (None, known[0]):
-            raise ConfigError(
-                f"policy: {result.key} was played by checkpoint {result.checkpoint!r}, the results in {self._out} "
-                f"are of {known[0]!r}; serve that one again, or choose another out folder"
-            )
 
     def _require_same_weights(self, result: EpisodeResult) -> None:
         if result.weights is None:
@@ -261,8 +251,7 @@ class Store:
         known = None if row is None else json.loads(row[0])
         swept = any(cell.step is not None for cell in self.cells if cell.policy.name == name)
         if known is not None:
-            what = next((one for one in IDENTITY[: 1 if swept else 2] if known.get(one) != metadata.get(one)), None)
-            if what is not None:
+            if (what := changed(known, metadata, swept=swept)) in ("policy", "checkpoint"):
                 raise ConfigError(
                     f"policy {name!r}: the server has {what} {metadata.get(what)!r}, the results in {self._out} are of "
                     f"{known.get(what)!r}; serve that one again, or choose another out folder"
@@ -282,7 +271,18 @@ class Store:
                 db.executescript(f"BEGIN; {SCHEMA} PRAGMA user_version = {VERSION}; COMMIT;")
             require_readable(self._out, db)
             self._require_resumable(db, config)
-            self._note_cells(db, config)
+            stop = config.stop.model_dump_json() if config.stop else None
+            with db:
+                for cell in self.cells:
+                    identity = (cell.policy.name, cell.step, cell.suite.name, cell.env)
+                    extent = (cell.planned, canonical(cell.suite.seeds), stop)
+                    row = (cell.fingerprint, *identity, canonical(cell.settings), *extent, canonical(cell.program))
+                    db.execute(
+                        "INSERT INTO cells (cell, policy, step, suite, env, settings, planned, seeds, stop, program)"
+                        " VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?, ?)"
+                        " ON CONFLICT DO UPDATE SET planned = ?, seeds = ?, stop = ?",
+                        row + extent,
+                    )
         except BaseException:
             db.close()
             raise
@@ -303,12 +303,17 @@ class Store:
             )
         found = [f"- {text}" for cell in self.cells for text in _differences(db, cell)]
         if found:
+            odd = "\n".join(found)
             raise ConfigError(
-                f"{self._out} has results of other settings:\n"
-                + "\n".join(found)
-                + "\ntake the old settings, or choose another out folder"
+                f"{self._out} has results of other settings:\n{odd}\n"
+                f"take the old settings, or choose another out folder"
             )
-        lacking, programs = self._other_plan(db), self._other_programs(db)
+        lacking, programs = self._other_plan(db), dict[Change, None]()
+        for cell in self.cells:
+            query = "SELECT program FROM cells WHERE env = ? AND program IS NOT NULL AND cell = ?"
+            row = db.execute(query, (cell.env, cell.fingerprint)).fetchone()
+            if row is not None:
+                programs |= dict.fromkeys(program_changes(f"env {cell.env}", json.loads(row[0]), cell.program))
         self._accept_or_raise(
             "plan",
             lacking,
@@ -316,7 +321,7 @@ class Store:
             "plan these, too; give a new folder (--out); or add to the results and have the report say so "
             "(--accept-changes)",
         )
-        self._accept_or_raise("program", programs, "the environment is not that of the results in")
+        self._accept_or_raise("program", list(programs), "the environment is not that of the results in")
 
     def _other_plan(self, db: sqlite3.Connection) -> list[Change]:
         """Return the cells of the results that this plan lacks; a plan may grow, also by steps of a policy.
@@ -324,35 +329,12 @@ class Store:
         A trainer evaluates versions of policies one after the other into one folder, each with its plan, so cells of
         other policies are not missing.
         """
-        trained = all(self._pushed.values())
+        trained = all(cell.policy.pushed_weights for cell in self.cells)
         policies = {cell.policy.name for cell in self.cells}
         mine = {(cell.policy.name, cell.suite.name, cell.env) for cell in self.cells}
         rows = db.execute("SELECT DISTINCT policy, suite, env FROM cells WHERE cell IN (SELECT cell FROM episodes)")
         gone = [" ".join(filter(None, row)) for row in rows if row not in mine and (row[0] in policies or not trained)]
         return [Change("plan", name, "in it", None) for name in gone]
-
-    def _other_programs(self, db: sqlite3.Connection) -> list[Change]:
-        """Return the files of environments that differ from those of the results."""
-        found: dict[Change, None] = {}  # in the order of the plan
-        for cell in self.cells:
-            query = "SELECT program FROM cells WHERE env = ? AND program IS NOT NULL AND cell = ?"
-            row = db.execute(query, (cell.env, cell.fingerprint)).fetchone()
-            if row is not None:
-                found |= dict.fromkeys(program_changes(f"env {cell.env}", json.loads(row[0]), cell.program))
-        return list(found)
-
-    def _note_cells(self, db: sqlite3.Connection, config: EvalConfig) -> None:
-        stop = config.stop.model_dump_json() if config.stop else None
-        with db:
-            for cell in self.cells:
-                identity = (cell.policy.name, cell.step, cell.suite.name, cell.env)
-                extent = (cell.planned, canonical(cell.suite.seeds), stop)
-                db.execute(
-                    "INSERT INTO cells (cell, policy, step, suite, env, settings, planned, seeds, stop, program)"
-                    " VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?, ?)"
-                    " ON CONFLICT DO UPDATE SET planned = ?, seeds = ?, stop = ?",
-                    (cell.fingerprint, *identity, canonical(cell.settings), *extent, canonical(cell.program), *extent),
-                )
 
 
 def _differences(db: sqlite3.Connection, cell: EvalCase) -> list[str]:

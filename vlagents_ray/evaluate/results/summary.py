@@ -7,18 +7,19 @@ import re
 from collections.abc import Iterable, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal, get_args
 
 import numpy as np
 
 from vlagents_ray.evaluate.artifacts.storage import whole
 from vlagents_ray.evaluate.episode.records import EpisodeResult
 from vlagents_ray.evaluate.results.comparison import gap_to_synchronous
-from vlagents_ray.evaluate.results.reader import CellResults, Results, Run, by_timing, rate_of
+from vlagents_ray.evaluate.results.reader import CellResults, Results, by_timing, rate_of
 from vlagents_ray.evaluate.results.statistics import Rate
 
 FILE = "summary.json"
 TOTAL = "total"
+Stated = Literal["checkpoint", "weights", "revision"]  # of an episode's result
 
 
 @dataclass(frozen=True, slots=True)
@@ -131,7 +132,7 @@ class Summary:
         """Return the content of summary.json."""
         cells = [
             group.to_json()
-            | {"checkpoint": checkpoint_of(cell), "weights": weights_of(cell), "revision": revision_of(cell)}
+            | {what: stated(cell, what) for what in get_args(Stated)}
             | {"pushed_weights": pushed_of(cell)}
             | {"settings": cell.settings, "env": cell.env}
             | {"described": cell.described, "contract": cell.contract, "code": cell.code}
@@ -160,28 +161,25 @@ class Summary:
 
 def summarize(results: Results) -> Summary:
     """Aggregate results, those of earlier runs included."""
+    wall_s = rollout_s = 0.0
+    for run in results.runs:
+        played = [one for cell in results.cells for one in cell.episodes if one.run == run.run]
+        last = max((one.finished for one in played), default=run.started)
+        wall_s += (last if run.ended is None else run.ended) - run.started  # a killed one ended with its last episode
+        rollout_s += last - min((one.finished - one.result.seconds for one in played), default=last)
     return Summary(
         results,
         tuple(group_of((cell.contender, cell.suite, cell.env), [cell]) for cell in results.cells),
         tuple(group_of((name, "", TOTAL), results.of(name)) for name in results.contenders),
-        wall_seconds=sum(_wall_seconds(results, run) for run in results.runs),
-        rollout_seconds=sum(_rollout_seconds(results, run) for run in results.runs),
+        wall_s,
+        rollout_s,
     )
 
 
-def checkpoint_of(cell: CellResults) -> str | None:
-    """Return the checkpoint of a cell's episodes; None if no reset named one."""
-    return next((one.checkpoint for one in cell.counted if one.checkpoint is not None), None)
-
-
-def weights_of(cell: CellResults) -> str | None:
-    """Return the digest of the weights of a cell's episodes; None if no server reported it."""
-    return next((one.weights for one in cell.counted if one.weights is not None), None)
-
-
-def revision_of(cell: CellResults) -> str | None:
-    """Return the hub's commit of these weights; None if they are not from the hub's cache."""
-    return next((one.revision for one in cell.counted if one.revision is not None), None)
+def stated(cell: CellResults, what: Stated) -> str | None:
+    """Return the checkpoint, the digest of the weights, or the weights' commit on the hub; None if none was stated."""
+    found: list[str | None] = [getattr(one, what) for one in cell.counted]
+    return next((one for one in found if one is not None), None)
 
 
 def pushed_of(cell: CellResults) -> str | None:
@@ -242,16 +240,12 @@ def group_of(name: tuple[str, str, str], cells: Sequence[CellResults]) -> Group:
         ),
         retries=sum(attempt.retried for cell in cells for attempt in cell.attempts),
         steps=sum(one.steps for one in finished),
-        mean_steps=_mean([one.steps for one in finished]),
-        mean_return=_mean([one.episode_return for one in finished]),
+        mean_steps=float(np.mean([one.steps for one in finished])) if finished else None,
+        mean_return=float(np.mean([one.episode_return for one in finished])) if finished else None,
         env_step_ms=median([one.env_step_ms for one in finished]),
         policy_ms=median([one.policy_ms for one in finished]),
         policy_p95_ms=median([one.policy_p95_ms for one in finished]),
     )
-
-
-def _mean(values: Sequence[float]) -> float | None:
-    return float(np.mean(values)) if values else None
 
 
 def median(values: Iterable[float | None]) -> float | None:
@@ -263,21 +257,3 @@ def median(values: Iterable[float | None]) -> float | None:
 def _share(parts: Sequence[float | None], whole_s: float) -> float | None:
     known = [part for part in parts if part is not None]
     return sum(known) / whole_s if known and whole_s else None
-
-
-def _wall_seconds(results: Results, run: Run) -> float:
-    """Return the duration of a run; of a killed one, until its last episode."""
-    if run.ended is not None:
-        return run.ended - run.started
-    return max((finished for finished, _ in _played(results, run)), default=run.started) - run.started
-
-
-def _rollout_seconds(results: Results, run: Run) -> float:
-    played = _played(results, run)
-    return max(finished for finished, _ in played) - min(begun for _, begun in played) if played else 0.0
-
-
-def _played(results: Results, run: Run) -> list[tuple[float, float]]:
-    """Return the end and begin of each episode of a run, in seconds since 1970."""
-    mine = [one for cell in results.cells for one in cell.episodes if one.run == run.run]
-    return [(one.finished, one.finished - one.result.seconds) for one in mine]

@@ -37,13 +37,7 @@ SCENES = "scenes"
 _KEPT_QUALITY = 92  # JPEG, of the start pictures
 _OUTCOMES: dict[str, Outcome] = {"s": "success", "f": "failure", "p": "partial", "r": "repeat"}
 _Phase = Literal["scene", "playing", "verdict", "next", "end"]
-_CHOICES = {
-    "scene": {"ready", "end"},
-    "playing": {"stop"},
-    "verdict": {"success", "failure", "partial", "repeat"},
-    "next": set[str](),
-    "end": set[str](),
-}
+_CHOICES: dict[str, set[str]] = {"scene": {"ready", "end"}, "playing": {"stop"}, "verdict": {*_OUTCOMES.values()}}
 _AWAY_S = 3.0  # time without a request of the page after which the operator counts as away
 _LOOK_S = 0.1  # period of live pictures while the scene is set
 _BODY = 10_000  # bytes of an answer
@@ -191,13 +185,9 @@ class TerminalOperator(Operator):
 
     def prepare(self, trial: VisibleTrial, observe: Callable[[], Obs]) -> bool:
         self._say(f"\ntrial {trial.number} of {trial.total}: {trial.task}, scene {trial.scene}")
-        if trial.message:
-            self._say(f"  {trial.message}")
-        self._say(f"  {trial.instruction}")
-        if trial.setup:
-            self._say(f"  {trial.setup}")
-        for picture in trial.start.values():
-            self._say(f"  set it as in {picture}")
+        pictures = (f"set it as in {picture}" for picture in trial.start.values())
+        for line in filter(None, (trial.message, trial.instruction, trial.setup, *pictures)):
+            self._say(f"  {line}")
         while True:
             try:
                 typed = self._ask("Enter when the scene is ready, l to look at it over the start picture, q to end: ")
@@ -222,8 +212,13 @@ class TerminalOperator(Operator):
                 outcome = _OUTCOMES.get(self._ask(f"verdict ({choices}): ").strip().lower())
                 if outcome is None:
                     continue
-                earned = self._earned(trial) if outcome == "partial" and trial.rubric else ()
-                verdict = Verdict(outcome, earned, self._ask("why: " if outcome == "repeat" else "note: ").strip())
+                earned = []
+                for part, points in trial.rubric.items() if outcome == "partial" else ():
+                    if self._ask(f"  {part} ({points:g} points), reached? y/n: ").strip().lower().startswith("y"):
+                        earned.append(part)
+                verdict = Verdict(
+                    outcome, tuple(earned), self._ask("why: " if outcome == "repeat" else "note: ").strip()
+                )
             except EOFError:
                 raise KeyboardInterrupt from None
             try:
@@ -232,13 +227,6 @@ class TerminalOperator(Operator):
                 self._say(str(error))
             else:
                 return verdict
-
-    def _earned(self, trial: VisibleTrial) -> tuple[str, ...]:
-        return tuple(
-            part
-            for part, points in trial.rubric.items()
-            if self._ask(f"  {part} ({points:g} points), reached? y/n: ").strip().lower().startswith("y")
-        )
 
     def _look(self, trial: VisibleTrial, obs: Obs) -> None:
         if not trial.start:
@@ -405,8 +393,8 @@ class PageOperator(Operator):
             trial = self._trial
             if trial is None or about != (self._phase, trial.number, trial.attempt) or self._answer is not None:
                 return PlainTextResponse("the trial has gone on meanwhile", 409)
-            if answer["do"] not in _CHOICES[self._phase]:
-                return PlainTextResponse(f"do: want one of {sorted(_CHOICES[self._phase])}", 400)
+            if answer["do"] not in (choices := _CHOICES.get(self._phase, set())):
+                return PlainTextResponse(f"do: want one of {sorted(choices)}", 400)
             try:
                 if verdict is not None:
                     verdict.score(trial.rubric)

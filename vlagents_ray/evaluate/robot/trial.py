@@ -14,14 +14,13 @@ import numpy as np
 
 from vlagents_ray.chunking.player import ChunkPlayer, PlayerSettings
 from vlagents_ray.errors import CheckpointFailed, EnvFailed, InvalidAction, PolicyFailed, PolicyUnavailable
-from vlagents_ray.evaluate.episode.episode import transport_of
+from vlagents_ray.evaluate.episode.episode import EpisodeStats, transport_of
 from vlagents_ray.evaluate.episode.failures import env_side, policy_side
 from vlagents_ray.evaluate.episode.records import EpisodeResult
-from vlagents_ray.evaluate.episode.stats import EpisodeStats
 from vlagents_ray.evaluate.plan.cases import EvalCase
 from vlagents_ray.evaluate.plan.config import RobotConfig, canonical
 from vlagents_ray.evaluate.plan.jobs import EpisodeKey, Job
-from vlagents_ray.evaluate.robot.operator import Operator, Verdict
+from vlagents_ray.evaluate.robot.operator import Operator
 from vlagents_ray.evaluate.workers.rollout import AgentFactory
 from vlagents_ray.interface import Act, Agent, Obs
 from vlagents_ray.naming import plain
@@ -98,27 +97,12 @@ class PlayedTrial:
     metadata: dict[str, Any]  # of the policy's server
     ending: str  # in words that do not depend on the policy
 
-    def judged(self, verdict: Verdict, score: float) -> EpisodeResult:
-        """Return the result with the verdict.
-
-        A partial success counts as a failure in success rates; its score is stored as the return.
-        """
-        success = verdict.outcome == "success"
-        return replace(
-            self.result,
-            success_once=success,
-            success_at_end=success,
-            first_success=self.result.steps if success else None,
-            episode_return=score,
-        )
-
 
 class WatchedRobot(Robot):
-    """A robot whose errors become `EnvFailed`, and whose observations the operator sees."""
+    """A robot whose errors become `EnvFailed`."""
 
-    def __init__(self, robot: Robot, operator: Operator) -> None:
+    def __init__(self, robot: Robot) -> None:
         self._robot = robot
-        self._operator = operator
         self.simulated = getattr(robot, "simulated", False)
         self.stats: EpisodeStats | None = None  # of the running trial
 
@@ -210,7 +194,12 @@ def play(
             raise
         except PolicyFailed as error:
             failed = error
-        _require_alive(report)
+        for bark in report.barks:  # failures of infrastructure are not the policy's
+            if bark.startswith("server"):
+                raise PolicyUnavailable(f"the policy's server was silent: {bark}")
+            raise EnvFailed(f"robot: the control loop was held up: {bark}")
+        if 2 * report.safe.get("lost", 0) > report.jitter.get("ticks", 0):
+            raise PolicyUnavailable(f"the policy's server could not be reached: {report.reasons['lost']}")
         stats.ending = "policy_done" if report.done else "terminated" if stopped else "truncated"
         stats.ticks_held = report.safe_ticks
         result = stats.result(transport_of(agent), failed)
@@ -267,13 +256,3 @@ def _deadline_s(settings: RobotConfig) -> float:
     if settings.deadline_s is not None:
         return settings.deadline_s
     return 0.0 if settings.mode == "async" else _WAIT_S
-
-
-def _require_alive(report: LoopReport) -> None:
-    """Raise if the connection or the robot ended a trial: infrastructure failures are not the policy's."""
-    for bark in report.barks:
-        if bark.startswith("server"):
-            raise PolicyUnavailable(f"the policy's server was silent: {bark}")
-        raise EnvFailed(f"robot: the control loop was held up: {bark}")
-    if 2 * report.safe.get("lost", 0) > report.jitter.get("ticks", 0):
-        raise PolicyUnavailable(f"the policy's server could not be reached: {report.reasons['lost']}")

@@ -30,7 +30,6 @@ from vlagents_ray.errors import ConfigError, EnvFailed, MissingDependency, VLAge
 from vlagents_ray.evaluate.artifacts.recorder import Artifacts, EpisodeRecorder, RecorderFactory, Recording
 from vlagents_ray.evaluate.episode.episode import (
     EpisodeSettings,
-    Outcome,
     Phase,
     options_of_reset,
     run_episodes,
@@ -69,15 +68,6 @@ class Report:
     env: EnvInfo | None = None  # if an environment was made for the job
     policy: dict[str, Any] | None = None  # metadata of the policy ({} for a local one), if the connection is new
     worker: WorkerInfo | None = None  # if `env` or `policy` is new
-
-
-@dataclass(slots=True)
-class _Setup:
-    """The findings of a worker before an episode, whatever its outcome."""
-
-    env: EnvInfo | None = None
-    policy: dict[str, Any] | None = None
-    worker: WorkerInfo | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -128,9 +118,9 @@ class Rollout:
     def run(self, jobs: tuple[Job, ...]) -> list[Report]:
         """Play the episodes of one cell, in parallel if there are several; return a report for each."""
         self._thread = threading.get_ident()
-        setup = _Setup()
+        found: dict[str, Any] = {}  # fields of the first report, whatever the outcome
         try:
-            reports = self._played(jobs, setup)
+            reports = self._played(jobs, found)
         except VLAgentsError as error:
             reports = [Report(failure=explain(error))] * len(jobs)
         finally:
@@ -140,33 +130,48 @@ class Rollout:
             self._drop_agent()
         elif any(report.result is not None for report in reports):
             self._broken_agents = 0
-        return [replace(reports[0], env=setup.env, policy=setup.policy, worker=setup.worker), *reports[1:]]
+        return [replace(reports[0], **found), *reports[1:]]
 
     def close(self) -> None:
         self._drop_agent()
         self._drop_env()
 
-    def _played(self, jobs: tuple[Job, ...], setup: _Setup) -> list[Report]:
+    def _played(self, jobs: tuple[Job, ...], found: dict[str, Any]) -> list[Report]:
         cell = jobs[0].cell
         if self._agent is None or self._policy != cell.policy.name:
             self._agent = self._connect(cell.policy)
-            setup.policy = self._described or _metadata(self._agent)
+            found["policy"] = self._described or _metadata(self._agent)
         if self._env is None or self._place != cell.place:
             self._env = self._make_env(cell)
             # The driver may have another numpy, which cannot read this one's pickles.
-            setup.env = EnvInfo(
+            found["env"] = EnvInfo(
                 plain_values(self._env.describe()),
                 self._env.contract.to_json(),
                 code_of(env_class(cell.env).__module__),
+                env_program(cell, loaded_code),
+                socket.gethostname(),
             )
-            setup.env = replace(setup.env, program=env_program(cell, loaded_code), host=socket.gethostname())
         agent, env = self._agent, self._env
-        if setup.env is not None or setup.policy is not None:
+        if found:
             require_match(agent.contract, env.contract)
-            setup.worker = _worker_info(cell.policy.name, agent, env)
+            if (renderer := env.renderer()) is not None:
+                require_own(renderer)
+            name, where = None if renderer is None else renderer.name, (socket.gethostname(), this_node(), os.getpid())
+            found["worker"] = WorkerInfo(*where, cell.policy.name, transport_of(agent), name)
         with contextlib.ExitStack() as stack:
-            recordings = [stack.enter_context(self._recorders(self._config, env.contract.control_hz)) for _ in jobs]
-            outcomes = self._play(agent, env, jobs, recordings)
+            made = (self._recorders(self._config, env.contract.control_hz) for _ in jobs)
+            recordings = [stack.enter_context(contextlib.closing(one)) for one in made]
+            wanted = recordings[0].wants_images
+            outcomes = run_episodes(
+                env,
+                agent,
+                self._sessions_of(agent, env, len(jobs)),
+                [job.key for job in jobs],
+                EpisodeSettings(cell.policy.execute, cell.suite.clock, cell.suite.reset_options, cell.policy_options),
+                observers=recordings,
+                watch=self._set_phase,
+                images=wanted == "all" or (wanted == "failures" and self._renders_at_once(agent, env, cell.policy)),
+            )
             return [
                 Report(result=one, artifacts=self._finished(env, job, one, recording))
                 if isinstance(one, EpisodeResult)
@@ -192,21 +197,6 @@ class Rollout:
         """
         rows = policy.execute or (agent.contract.chunk if agent.contract is not None else None)
         return rows == 1 or self._surplus < 0 or not self._repeatable or not isinstance(env, SequentialBatch)
-
-    def _play(
-        self, agent: Agent, env: BatchEnv, jobs: tuple[Job, ...], recordings: list[EpisodeRecorder]
-    ) -> list[Outcome]:
-        cell, wanted = jobs[0].cell, recordings[0].wants_images
-        return run_episodes(
-            env,
-            agent,
-            self._sessions_of(agent, env, len(jobs)),
-            [job.key for job in jobs],
-            EpisodeSettings(cell.policy.execute, cell.suite.clock, cell.suite.reset_options, cell.policy_options),
-            observers=recordings,
-            watch=self._set_phase,
-            images=wanted == "all" or (wanted == "failures" and self._renders_at_once(agent, env, cell.policy)),
-        )
 
     def _sessions_of(self, agent: Agent, env: BatchEnv, number: int) -> list[Agent]:
         if env.num_envs == 1:
@@ -246,12 +236,10 @@ class Rollout:
         try:
             with env_side(f"{cell.env!r}: make"):
                 options, number = cell.suite.env_options, cell.suite.num_envs
-                alone = number == 1  # even if the suite has a simulator for many
-                env = (
-                    SequentialBatch([make_env(cell.env, **options)])
-                    if alone
-                    else make_batch(cell.env, number, **options)
-                )
+                if number == 1:  # even if the suite has a simulator for many
+                    env: BatchEnv = SequentialBatch([make_env(cell.env, **options)])
+                else:
+                    env = make_batch(cell.env, number, **options)
         except EnvFailed as error:
             reason = env_class(cell.env).missing()
             if reason is None:
@@ -281,15 +269,6 @@ def _metadata(agent: Agent) -> dict[str, Any]:
     return dict(getattr(agent, "metadata", {}))
 
 
-def _worker_info(policy: str, agent: Agent, env: BatchEnv) -> WorkerInfo:
-    """Return this process's entry in the results."""
-    renderer = env.renderer()
-    if renderer is not None:
-        require_own(renderer)
-    name = None if renderer is None else renderer.name
-    return WorkerInfo(socket.gethostname(), this_node(), os.getpid(), policy, transport_of(agent), name)
-
-
 def agents(config: EvalConfig, own: Callable[[], Agent] | None, rank: RankName = "simulation") -> AgentFactory:
     """Return the factory that a worker calls: `own`, or one of connections with this `rank`."""
     if own is not None:
@@ -301,9 +280,8 @@ def agents(config: EvalConfig, own: Callable[[], Agent] | None, rank: RankName =
 
 
 def _remote_agent(config: EvalConfig, rank: RankName, policy: PolicyConfig) -> RemoteAgent:
-    assert policy.url is not None  # noqa: S101 - `agents` has checked it
     return RemoteAgent(
-        policy.url,
+        str(policy.url),  # `agents` has checked that there is one
         transport=policy.transport,
         timeout_s=config.policy_timeout_s,
         connect_timeout_s=config.connect_timeout_s,

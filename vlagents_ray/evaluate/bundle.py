@@ -1,0 +1,596 @@
+"""An evaluation in one file, which others can cite, check, replay in part, and merge with their own.
+
+The file is a ZIP archive whose first member lists the others with their digests. An archive may come from a stranger.
+Its list of members is checked before any is read: `pack` could have written every name, so that none leads out of the
+folder; no member is a link; the sizes are bounded, and no member yields more bytes than it states. Nothing is unpickled
+or imported. A replay plays recorded actions in their environment, and compares; no policy is needed.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import math
+import os
+import re
+import sqlite3
+import stat
+import tempfile
+import zipfile
+import zlib
+from collections.abc import Iterator, Mapping
+from contextlib import closing
+from dataclasses import dataclass, field
+from glob import escape
+from itertools import islice, zip_longest
+from pathlib import Path
+from typing import IO, Any, Literal
+
+import numpy as np
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
+
+from vlagents_ray.envs.base import make_batch
+from vlagents_ray.errors import ConfigError, VLAgentsError
+from vlagents_ray.evaluate.artifacts.recorder import Trajectory
+from vlagents_ray.evaluate.artifacts.storage import (
+    PROVENANCE,
+    TRAJECTORIES,
+    VIDEOS,
+    inside,
+    link_or_copy,
+    require_below,
+    storing,
+    versions,
+    whole,
+)
+from vlagents_ray.evaluate.episode.episode import options_of_reset
+from vlagents_ray.evaluate.episode.failures import EnvStep, env_side
+from vlagents_ray.evaluate.episode.second_pass import play_actions
+from vlagents_ray.evaluate.plan.config import canonical, fingerprint
+from vlagents_ray.evaluate.report.page import FILE as REPORT
+from vlagents_ray.evaluate.report.page import write_report
+from vlagents_ray.evaluate.results.database import FILE as DATABASE
+from vlagents_ray.evaluate.results.reader import CellResults, Episode, Results, reading, table
+from vlagents_ray.evaluate.results.summary import summarize, write_summary
+from vlagents_ray.interface import Obs
+from vlagents_ray.registry import env_suite, names
+
+__all__ = ["Finding", "Verification", "verify", "write_bundle"]
+
+MANIFEST = "bundle.json"
+MOST_BYTES = 16 * 10**9  # of all members, unpacked
+_MOST_MEMBERS = 200_000
+_MOST_MANIFEST = 64 * 2**20  # bytes
+_CHUNK = 2**20
+_PART = r"[\w@-][\w.@-]{0,200}"  # of a path, as `naming.plain` leaves names: it neither is nor begins with a dot
+_KNOWN = re.compile(
+    rf"{re.escape(MANIFEST)}|{re.escape(DATABASE)}|{PROVENANCE}/[0-9a-f]{{64}}\.diff"
+    rf"|{TRAJECTORIES}/({_PART}/){{1,3}}{_PART}\.(npz|mp4)|{VIDEOS}/({_PART}/){{1,3}}{_PART}\.mp4"
+)
+_BROKEN = (zipfile.BadZipFile, zlib.error, EOFError, NotImplementedError, RuntimeError, ValueError)
+_DISTRUST = "no `vlagents-ray bundle` writes that: do not trust the author of this bundle"
+
+
+class FileDigest(BaseModel):
+    """A file of a bundle."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    sha256: str = Field(pattern="^[0-9a-f]{64}$")
+    size: int = Field(ge=0)  # bytes
+
+
+class Manifest(BaseModel):
+    """The content of `bundle.json`."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    format: Literal["vlagents-ray bundle"] = "vlagents-ray bundle"
+    version: Literal[1] = 1
+    files: dict[str, FileDigest]  # all others, by their paths
+
+
+def digest_of(path: Path) -> FileDigest:
+    sha256, size = hashlib.sha256(), 0
+    with path.open("rb") as file:
+        while chunk := file.read(_CHUNK):
+            sha256.update(chunk)
+            size += len(chunk)
+    return FileDigest(sha256=sha256.hexdigest(), size=size)
+
+
+def pack(folder: Path, archive: Path) -> str:
+    """Write all files of `folder` into the bundle `archive`, whole or not at all; the same files give the same bytes.
+
+    Returns:
+        The SHA-256 of the manifest, which identifies the content of the bundle.
+    """
+    paths = sorted(path for path in folder.rglob("*") if path.is_file())
+    names = {path.relative_to(folder).as_posix(): path for path in paths}
+    if odd := [name for name in names if not _KNOWN.fullmatch(name) or name == MANIFEST]:
+        raise ConfigError(f"{folder}: got the files {odd[:5]}, which a bundle may not hold; rename or remove them")
+    manifest = Manifest(files={name: digest_of(path) for name, path in names.items()})
+    text = (manifest.model_dump_json(indent=1) + "\n").encode()
+    with whole(archive) as part, zipfile.ZipFile(part, "w", zipfile.ZIP_DEFLATED) as file:
+        file.writestr(_member(MANIFEST), text, zipfile.ZIP_DEFLATED)
+        for name, path in names.items():
+            how = zipfile.ZIP_STORED if path.suffix in (".mp4", ".npz") else zipfile.ZIP_DEFLATED  # already compressed
+            with path.open("rb") as source, file.open(_member(name, how), "w", force_zip64=True) as target:
+                while chunk := source.read(_CHUNK):
+                    target.write(chunk)
+    return hashlib.sha256(text).hexdigest()
+
+
+def _member(name: str, how: int = zipfile.ZIP_DEFLATED) -> zipfile.ZipInfo:
+    member = zipfile.ZipInfo(name)  # of 1980: the time is not part of the results
+    member.compress_type, member.external_attr = how, (stat.S_IFREG | 0o644) << 16
+    return member
+
+
+def unpack(archive: Path, folder: Path, *, most_bytes: int = MOST_BYTES) -> tuple[Manifest, str, list[str]]:
+    """Write the files of a bundle into `folder`, without its manifest.
+
+    Returns:
+        The manifest, its SHA-256, and the differences between the manifest and the files, a sentence each.
+
+    Raises:
+        ConfigError: The file is no bundle, or is larger than allowed, or has a name that leads out of `folder`.
+    """
+    if not archive.is_file():
+        raise ConfigError(f"{archive}: got no file, want a bundle that `vlagents-ray bundle` wrote")
+    try:
+        with zipfile.ZipFile(archive) as file:
+            members = _checked(archive, file, most_bytes)
+            manifest, sha256 = _manifest(archive, file, members.pop(MANIFEST, None))
+            found: dict[str, FileDigest] = {}
+            for name, member in members.items():
+                target = folder / name
+                target.parent.mkdir(parents=True, exist_ok=True)
+                with file.open(member) as source, target.open("xb") as written:
+                    found[name] = _copy(archive, source, written, member)
+    except ConfigError:
+        raise
+    except _BROKEN as error:
+        raise ConfigError(f"{archive}: cannot be read as a bundle ({error}); copy it again from its source") from error
+    stated = manifest.files
+    odd = [f"{name} is not in the bundle" for name in stated.keys() - found.keys()]
+    odd += [f"{name} is not in the manifest" for name in found.keys() - stated.keys()]
+    odd += [f"{name} has another digest" for name in stated.keys() & found.keys() if stated[name] != found[name]]
+    return manifest, sha256, sorted(odd)
+
+
+def _checked(archive: Path, file: zipfile.ZipFile, most_bytes: int) -> dict[str, zipfile.ZipInfo]:
+    """Return the members by their names, after all checks that need not read them."""
+    listed = file.infolist()
+    if len(listed) > _MOST_MEMBERS:
+        raise ConfigError(f"{archive}: got {len(listed)} files, want at most {_MOST_MEMBERS}; {_DISTRUST}")
+    members: dict[str, zipfile.ZipInfo] = {}
+    for member in listed:
+        name = member.orig_filename
+        kind = stat.S_IFMT(member.external_attr >> 16)
+        if not _KNOWN.fullmatch(name) or member.filename != name:
+            raise ConfigError(f"{archive}: got the file {name!r}, want those of a folder of results; {_DISTRUST}")
+        if name in members:
+            raise ConfigError(f"{archive}: got {name!r} twice; {_DISTRUST}")
+        if kind not in (0, stat.S_IFREG):
+            raise ConfigError(f"{archive}: {name!r} is a link or another special file; {_DISTRUST}")
+        if member.flag_bits & 0x1 or member.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
+            raise ConfigError(f"{archive}: {name!r} is encrypted, or packed in another way than a bundle; {_DISTRUST}")
+        members[name] = member
+    if (total := sum(member.file_size for member in listed)) > most_bytes:
+        raise ConfigError(
+            f"{archive}: unpacks to {total} bytes, want at most {most_bytes}; allow more with --most-gb if you trust it"
+        )
+    return members
+
+
+def _manifest(archive: Path, file: zipfile.ZipFile, member: zipfile.ZipInfo | None) -> tuple[Manifest, str]:
+    if member is None:
+        raise ConfigError(f"{archive}: has no {MANIFEST}, want a bundle that `vlagents-ray bundle` wrote")
+    if member.file_size > _MOST_MANIFEST:
+        raise ConfigError(f"{archive}: {MANIFEST} has {member.file_size} bytes, want at most {_MOST_MANIFEST}")
+    with file.open(member) as opened:
+        text = opened.read(_MOST_MANIFEST + 1)
+    try:
+        return Manifest.model_validate_json(text), hashlib.sha256(text).hexdigest()
+    except ValidationError as error:
+        first = error.errors(include_url=False, include_input=False)[0]
+        where = ".".join(map(str, first["loc"]))
+        raise ConfigError(
+            f"{archive}: {MANIFEST} is not one of version 1: {where}: {first['msg']}; read it with the version of "
+            f"vlagents-ray that wrote it"
+        ) from error
+
+
+def _copy(archive: Path, source: IO[bytes], target: IO[bytes], member: zipfile.ZipInfo) -> FileDigest:
+    sha256, size = hashlib.sha256(), 0
+    while chunk := source.read(_CHUNK):
+        size += len(chunk)
+        if size > member.file_size:
+            raise ConfigError(f"{archive}: {member.filename!r} has more bytes than it states; {_DISTRUST}")
+        sha256.update(chunk)
+        target.write(chunk)
+    return FileDigest(sha256=sha256.hexdigest(), size=size)
+
+
+def write_bundle(folder: Path, archive: Path, *, videos: bool = False) -> str:
+    """Write the results in `folder` as one file that others can check (`verify`).
+
+    It holds the present results.db, the differences from the commits, and the trajectories, by which episodes are
+    played again, but nothing that is computed from these. The database names only files in the bundle, so that its
+    results can be merged with others.
+
+    Args:
+        folder: A folder of results, to which an evaluation may be writing; nothing in it is changed.
+        videos: Whether the bundle also holds the videos: those of the report, and of the policy's images.
+
+    Returns:
+        The SHA-256 of its manifest, which identifies its content.
+
+    Raises:
+        ConfigError: The folder has no results, or one of its files is outside of it.
+        StorageFailed: The disk is full, or cannot be written to.
+    """
+    with storing(archive.parent):
+        archive.parent.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryDirectory(prefix=f"{archive.name}.part-", dir=archive.parent) as temporary:
+            stage = Path(temporary)
+            # One consistent state, even while an evaluation writes to it.
+            with reading(folder) as source, closing(sqlite3.connect(stage / DATABASE)) as target:
+                source.backup(target)
+            _link_files(folder, stage, Results.load(stage), videos=videos)
+            # Remove the names of files that are not in the bundle.
+            with closing(sqlite3.connect(stage / DATABASE)) as db, db:
+                for key, shown, numbers in db.execute("SELECT key, videos, trajectory FROM episodes").fetchall():
+                    there = [path for path in json.loads(shown) if (stage / path).is_file()]
+                    values = canonical(there), numbers if numbers and (stage / numbers).is_file() else None, key
+                    db.execute("UPDATE episodes SET videos = ?, trajectory = ? WHERE key = ?", values)
+            return pack(stage, archive)
+
+
+def _link_files(folder: Path, stage: Path, results: Results, *, videos: bool) -> None:
+    paths: list[str] = []
+    for cell in results.cells:
+        for one in cell.episodes:
+            if videos:
+                paths += one.videos
+            if one.trajectory is not None:
+                paths.append(require_below(one.trajectory))
+                numbers = folder / one.trajectory
+                seen = sorted(numbers.parent.glob(f"{escape(numbers.stem)}_*.mp4")) if videos else []
+                paths += [str(path.relative_to(folder)) for path in seen]
+    paths += [f"{PROVENANCE}/{path.name}" for path in sorted((folder / PROVENANCE).glob("*.diff"))]
+    for path in dict.fromkeys(paths):
+        source = inside(folder, path)
+        if source.is_file():  # a folder that was copied without its videos can be bundled
+            link_or_copy(source, stage / path)
+
+
+Verdict = Literal["equal", "differs", "other here", "not checked"]
+MOST_TRAJECTORY = 2**30  # bytes of one, unpacked
+_TOLERANCE = 1e-9  # relative: sums of floating-point numbers may differ in their last bits
+_SHOWN = 3  # differences in a finding
+_LENGTH = 80  # characters of a value in a finding
+_SOFTWARE = ("python", "platform", "vlagents-ray", "ray", "numpy", "av")  # keys of `versions`
+
+
+@dataclass(frozen=True, slots=True)
+class Finding:
+    """One check.
+
+    "differs" means that the bundle contradicts itself, or that a replay had another outcome; "other here" means other
+    software or numbers here, which alone is no fault of the bundle.
+    """
+
+    subject: str
+    verdict: Verdict
+    detail: str
+
+
+@dataclass(frozen=True, slots=True)
+class Verification:
+    """The findings on a bundle."""
+
+    digest: str  # SHA-256 of the bundle's manifest, which identifies its content
+    findings: list[Finding]
+
+    @property
+    def holds(self) -> bool:
+        """Whether nothing contradicts the bundle."""
+        return all(one.verdict != "differs" for one in self.findings)
+
+
+def verify(
+    bundle: Path, *, into: Path | None = None, replay: int = 3, trust: bool = False, most_bytes: int = MOST_BYTES
+) -> Verification:
+    """Check a bundle, which may come from a stranger.
+
+    None of its text is run, imported or unpickled. Its environments are only made if they are registered here and their
+    options are numbers and words, unless `trust` is set.
+
+    Args:
+        bundle: The file.
+        into: A new folder for its results, which can be read, merged and exported as any others; None: they are
+            removed. Summary and report in it are written from the database.
+        replay: The number of episodes whose recorded actions are played again.
+        trust: Whether its environments may name any code and files.
+        most_bytes: The most bytes that its files may have together.
+
+    Returns:
+        The findings.
+
+    Raises:
+        ConfigError: The file is no bundle, is larger than allowed, or its database cannot be read; or `into` exists.
+        StorageFailed: The disk is full, or cannot be written to.
+    """
+    if into is not None and into.exists():
+        raise ConfigError(f"{into}: is there already; want a new folder")
+    parent = None if into is None else into.absolute().parent
+    with storing(parent or Path(tempfile.gettempdir())):
+        if parent is not None:
+            parent.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryDirectory(prefix="bundle.part-", dir=parent) as temporary:
+            folder = Path(temporary) / (into or bundle).name  # the name is in the report
+            folder.mkdir()
+            manifest, digest, odd = unpack(bundle, folder, most_bytes=most_bytes)
+            fine = f"{len(manifest.files)} files have the SHA-256 that {MANIFEST} states"
+            findings = [_finding("digests", odd, fine)]
+            try:
+                findings += _check(folder, replay, trust=trust)
+            except (VLAgentsError, sqlite3.Error):
+                raise
+            except (ArithmeticError, LookupError, RecursionError, TypeError, ValueError, AttributeError) as error:
+                raise ConfigError(
+                    f"{bundle}: its database holds values that no evaluation writes ({type(error).__name__}: {error}); "
+                    f"do not trust its author"
+                ) from error
+            if into is not None:
+                os.replace(folder, into)
+    return Verification(digest, findings)
+
+
+def _check(folder: Path, replay: int, *, trust: bool) -> Iterator[Finding]:
+    """Yield all findings except that of the digests; also write summary and report."""
+    if not (folder / DATABASE).is_file():
+        raise ConfigError(f"got no {DATABASE} in the bundle; want one that `vlagents-ray bundle` wrote")
+    results = Results.load(folder)
+    if not results.runs or not results.cells:
+        raise ConfigError(f"{DATABASE}: has no run, or no cell; want the results of an evaluation")
+    yield _check_cells(results)
+    write_summary(summarize(results))
+    write_report(results, folder / REPORT)
+    yield _check_trajectories(results)
+    yield _check_versions(results)
+    if not replay:
+        yield Finding("replay", "not checked", "was not asked for (--replay 0)")
+        return
+    # The first episode with a recording of each cell in turns, then the second of each, and so on.
+    by_cell = [[(cell, one) for one in cell.episodes if one.result.status == "done"] for cell in results.cells]
+    turns = (pair for turn in zip_longest(*by_cell) for pair in turn if pair is not None)
+    found = ((*pair, trajectory) for pair in turns if (trajectory := _recorded(results, pair[1])) is not None)
+    chosen = list(islice(found, replay))
+    if not chosen:
+        yield Finding("replay", "not checked", "no finished episode has a recording (eval --record all)")
+    for cell, episode, trajectory in chosen:
+        yield _replay(cell, episode, trajectory, trust=trust)
+
+
+def _check_cells(results: Results) -> Finding:
+    """Check that the cells and the keys of their episodes are those of their settings."""
+    odd = []
+    for cell in results.cells:
+        named = cell.settings.get("env"), cell.settings.get("policy")
+        if fingerprint(cell.settings) != cell.cell or named != (cell.env, cell.policy):
+            odd.append(f"{cell.contender} in {cell.task}: its settings are not those of its key")
+        found = [one.result.key for one in cell.episodes]
+        odd += [f"{key}: is of another cell or env" for key in found if key.env != cell.env]
+    stated = {str(one.result.key) for cell in results.cells for one in cell.episodes}
+    with reading(results.out) as db:
+        keys = {row["key"] for row in table(db, "episodes")}
+    odd += [f"{key}: its key does not match its columns, or it has no cell" for key in sorted(keys - stated)]
+    return _finding("database", odd, f"{len(results.cells)} cells and {len(keys)} episodes have their settings' keys")
+
+
+def _check_trajectories(results: Results) -> Finding:
+    """Check that each recording has the actions, steps, rewards and success of its episode in the table."""
+    odd: list[str] = []
+    checked, missing = 0, 0
+    for cell in results.cells:
+        for one in cell.episodes:
+            if one.result.status != "done":
+                continue
+            if (trajectory := _recorded(results, one)) is None:
+                missing += 1
+                continue
+            checked += 1
+            odd += [f"{one.result.key}: {text}" for text in _contradictions(one, trajectory)]
+    if not checked and not odd:
+        return Finding("trajectories", "not checked", f"the bundle has none of {missing} episodes (eval --record all)")
+    rest = f"; {missing} others have none" if missing else ""
+    return _finding("trajectories", odd, f"{checked} have the actions, rewards and outcomes of the table{rest}")
+
+
+def _recorded(results: Results, episode: Episode) -> Trajectory | None:
+    """Return the recording of an episode; None if the bundle has none. Raises `ConfigError` if it cannot be read."""
+    if episode.trajectory is None or not (path := results.file(episode.trajectory)).is_file():
+        return None
+    try:
+        with zipfile.ZipFile(path) as file:
+            size = sum(member.file_size for member in file.infolist())
+    except (OSError, zipfile.BadZipFile) as error:
+        raise ConfigError(f"{episode.trajectory}: cannot be read as a trajectory ({error})") from error
+    if size > MOST_TRAJECTORY:
+        raise ConfigError(f"{episode.trajectory}: unpacks to {size} bytes, want at most {MOST_TRAJECTORY}")
+    try:
+        return Trajectory.load(path)
+    except MemoryError as error:  # its header states a wrong size
+        raise ConfigError(f"{episode.trajectory}: states a size that does not fit into memory") from error
+
+
+def _contradictions(episode: Episode, trajectory: Trajectory) -> Iterator[str]:
+    result, steps = episode.result, len(trajectory.actions)
+    shapes = [trajectory.rewards.shape == (steps,), trajectory.success.shape == (steps,)]
+    shapes += [len(values) == steps + 1 for values in trajectory.state.values()]
+    shapes += [] if trajectory.gripper is None else [trajectory.gripper.shape == (steps + 1,)]
+    if not all(shapes) or result.steps != steps:
+        yield f"{result.steps} steps in the table, other lengths in the recording"
+        return
+    if hashlib.sha256(np.ascontiguousarray(trajectory.actions, "<f4").tobytes()).hexdigest() != result.actions_sha256:
+        yield "the recorded actions are not those of the table's digest"
+    total = float(sum(trajectory.rewards.tolist()))
+    if not math.isclose(total, result.episode_return, rel_tol=_TOLERANCE, abs_tol=1e-12):
+        yield "the recorded rewards have another sum"
+    if _outcome(trajectory.success.astype(bool).tolist())[1:] != (result.success_at_end, result.first_success):
+        yield "the recorded success is not that of the table"
+
+
+def _outcome(success: list[bool]) -> tuple[bool, bool, int | None]:
+    """Return success once, success at the end, and the number of steps after which it was first solved."""
+    first = next((number for number, solved in enumerate(success, 1) if solved), None)
+    return first is not None, bool(success and success[-1]), first
+
+
+def _finding(subject: str, odd: list[str], fine: str) -> Finding:
+    if not odd:
+        return Finding(subject, "equal", fine)
+    more = f"; and {len(odd) - _SHOWN} more" if len(odd) > _SHOWN else ""
+    return Finding(subject, "differs", "; ".join(odd[:_SHOWN]) + more)
+
+
+def _check_versions(results: Results) -> Finding:
+    """Compare the software of the last run with that here."""
+    there, here = results.runs[-1].versions, versions()
+    stated = {name: (there.get(name), here[name]) for name in _SOFTWARE} | {"commit": (_commit(there), _commit(here))}
+    odd = [f"{name} {was} there, {now} here" for name, (was, now) in stated.items() if was != now]
+    if odd:
+        return Finding("versions", "other here", "; ".join(odd))
+    return Finding("versions", "equal", ", ".join(f"{name} {now}" for name, (_, now) in stated.items()))
+
+
+def _commit(found: Mapping[str, Any]) -> str:
+    code = found.get("code")
+    state = code.get("vlagents_ray") if isinstance(code, dict) else None
+    if not isinstance(state, dict) or state.get("commit") is None:
+        return "unknown"
+    return f"{state['commit']} with changes" if state.get("diff_sha256") else str(state["commit"])
+
+
+_CODE = re.compile("trust.*|module|source_dir")  # options that choose code, although they may be words
+_WORD = re.compile(r"\w[\w.+-]{0,63}")  # a value that is text, and no path, URL or "module:Class"
+
+
+@dataclass(slots=True)
+class Replayed:
+    """The recorded actions in an environment here, compared with the recording step by step."""
+
+    recorded: Trajectory
+    success: list[bool] = field(default_factory=list)  # after each step
+    differs_from: int | None = None  # first step with another state, reward or success; 0 is the reset
+    largest: float = 0.0  # difference of a number of the state or of a reward
+    described: Mapping[str, Any] = field(default_factory=dict)  # by the environment here
+
+    def add(self, number: int, obs: Obs, step: EnvStep | None) -> None:
+        """Compare an observation, and the other outputs of its step, of which the reset has none."""
+        now = {part: np.asarray(values, np.float32) for part, values in obs.state.items()}
+        if now.keys() != self.recorded.state.keys() or (obs.gripper is None) != (self.recorded.gripper is None):
+            self._differ(number, float("inf"))
+        else:
+            for part, values in now.items():
+                self._compare(number, self.recorded.state[part][number], values)
+            if self.recorded.gripper is not None:
+                self._compare(number, self.recorded.gripper[number], np.asarray(obs.gripper, np.float32))
+        if step is not None:
+            self.success.append(step.success)
+            self._compare(number, self.recorded.rewards[number - 1], np.float64(step.reward))
+            if bool(self.recorded.success[number - 1]) != step.success:
+                self._differ(number, 0.0)
+
+    def _compare(self, number: int, before: Any, now: Any) -> None:
+        if before.shape != now.shape:
+            self._differ(number, float("inf"))
+        elif before.tobytes() != now.tobytes():
+            self._differ(number, float(np.max(np.abs(np.asarray(before, np.float64) - np.asarray(now, np.float64)))))
+
+    def _differ(self, number: int, by: float) -> None:
+        self.differs_from = number if self.differs_from is None else self.differs_from
+        self.largest = max(self.largest, by)
+
+
+def require_harmless(cell: CellResults) -> None:
+    """Raise `ConfigError` unless making this environment runs no code but that of a registered one.
+
+    A bundle may come from a stranger: "module:Class" would be imported, and an option that is a path or a nested value
+    could name files or code of this machine. `trust_remote_code` from a bundle is refused: only the local user
+    can grant it.
+    """
+    if env_suite(cell.env) not in names("envs") or ":" in cell.env:
+        raise ConfigError(f"{cell.env}: is no registered environment; --trust makes it, and runs its code")
+    for kind in ("env_options", "reset_options"):
+        stated = cell.settings.get(kind) or {}
+        odd = {name: value for name, value in stated.items() if _CODE.fullmatch(name) or not _is_plain(value)}
+        if odd:
+            raise ConfigError(f"{cell.env}: got the {kind} {odd}, which could name files or code; --trust takes them")
+
+
+def replay_actions(cell: CellResults, episode: Episode, trajectory: Trajectory) -> Replayed:
+    """Play the actions of `trajectory` in the environment of `cell`, from the episode's seed on.
+
+    Images are neither rendered nor compared. State, gripper, rewards and success are, bit by bit.
+
+    Raises:
+        ConfigError: The environment refuses these options, or is unknown here; also `MissingDependency`.
+        EnvFailed: The simulator failed.
+    """
+    key = episode.result.key
+    with env_side("make"):
+        env = make_batch(cell.env, 1, **(cell.settings.get("env_options") or {}))
+    try:
+        with env_side("reset"):
+            begin = options_of_reset(env, key.episode, cell.settings.get("reset_options"))
+        played = Replayed(trajectory)
+        for number, (obs, step) in enumerate(play_actions(env, key.seed, begin, trajectory.actions, images=False)):
+            played.add(number, obs, step)
+        with env_side("describe"):
+            played.described = env.describe()
+        return played
+    finally:
+        with env_side("close"):
+            env.close()
+
+
+def _is_plain(value: object) -> bool:
+    if isinstance(value, list):
+        return all(_is_plain(one) for one in value)
+    if isinstance(value, str):
+        return _WORD.fullmatch(value) is not None
+    return value is None or isinstance(value, bool | int | float)
+
+
+def _replay(cell: CellResults, episode: Episode, trajectory: Trajectory, *, trust: bool) -> Finding:
+    subject = f"replay of {cell.env}#{episode.result.key.episode}@{episode.result.key.seed}"
+    if cell.settings.get("robot") is not None:
+        return Finding(subject, "not checked", "it was played on a real robot")
+    try:
+        if not trust:
+            require_harmless(cell)
+        played = replay_actions(cell, episode, trajectory)
+    except VLAgentsError as error:
+        return Finding(subject, "not checked", str(error))
+    result, outcome, steps = episode.result, _outcome(played.success), len(played.success)
+    differs = f"the numbers differ from step {played.differs_from} of {steps} on, by at most {played.largest:.3g}"
+    if outcome != (result.success_once, result.success_at_end, result.first_success):
+        now, then = ("solved" if solved else "not solved" for solved in (outcome[0], result.success_once))
+        return Finding(subject, "differs", f"{now} here, {then} there; {differs}")
+    same = played.differs_from is None
+    detail = f"{steps} actions, every state, reward and success to the bit"
+    if not same:
+        detail = f"the same outcome, other numbers; {differs}"
+    there, here = cell.described, played.described
+    odd = [
+        f"{name} {str(here.get(name))[:_LENGTH]}, there {str(there.get(name))[:_LENGTH]}"
+        for name in sorted(there.keys() | here.keys())
+        if there.get(name) != here.get(name)
+    ]
+    if odd:
+        detail += f"; the environment says of itself here: {'; '.join(odd)}"
+    return Finding(subject, "equal" if same else "other here", detail)
