@@ -24,15 +24,7 @@ from vlagents_ray.policies.base import ModelConfig, ModelPolicy, Prediction, Row
 from vlagents_ray.policies.base.accelerator import ensure_torchvision, fetch, torch_device, torch_dtype
 from vlagents_ray.policies.base.checkpoint import SavedTensors, find_checkpoint, require_loaded
 from vlagents_ray.policies.base.model_code import remote_code, use_source
-from vlagents_ray.policies.base.model_inputs import (
-    GRIPPER,
-    camera_images,
-    camera_specs,
-    choose_cameras,
-    needs_gripper,
-    state_specs,
-    state_vector,
-)
+from vlagents_ray.policies.base.model_inputs import GRIPPER, camera_images, choose_cameras, state_vector
 from vlagents_ray.policies.compilation import Compilation
 from vlagents_ray.registry import require
 
@@ -476,15 +468,8 @@ class Gr00t(ModelPolicy):
         robot = self.model.embodiment
         parts = self._parts(robot)
         own = {part: StateSpec(width) for part, width in parts.items() if part != GRIPPER}
-        return Contract(
-            cameras=camera_specs(self._cameras(robot)),
-            state=own if self.config.state is None else state_specs(list(parts), self.state_dim),
-            gripper=needs_gripper(list(parts)),
-            instruction=True,
-            action=robot.spec,
-            chunk=self.chunk(robot.horizon),
-            history=self.history,
-        )
+        state = {"state": own} if self.config.state is None else {}
+        return self.stated(self._cameras(robot), list(parts), robot.horizon, action=robot.spec, **state)
 
     def load(self) -> Gr00tNetwork:
         """Read the checkpoint; raises `ConfigError` for settings that do not fit it."""

@@ -22,15 +22,7 @@ from vlagents_ray.policies.base.accelerator import fetch, jax_device, torch_devi
 from vlagents_ray.policies.base.checkpoint import STEP, SavedTensors, find_checkpoint, require_loaded
 from vlagents_ray.policies.base.config import Guidance, NoiseLevel
 from vlagents_ray.policies.base.model_code import use_source
-from vlagents_ray.policies.base.model_inputs import (
-    CLOSED,
-    GRIPPER,
-    camera_images,
-    camera_specs,
-    choose_cameras,
-    needs_gripper,
-    state_vector,
-)
+from vlagents_ray.policies.base.model_inputs import CLOSED, GRIPPER, camera_images, choose_cameras, state_vector
 from vlagents_ray.policies.compilation import Compilation
 from vlagents_ray.policies.flow import OFFERED, Change, Guide, Pi0Passes, RandomSteps
 from vlagents_ray.registry import require
@@ -502,14 +494,13 @@ class OpenPi(ModelPolicy):
             return Contract()
         robot = self.model.robot
         parts = {part: dim for vector in robot.state.values() for part, dim in vector.items()}
-        return Contract(
-            cameras=camera_specs(robot.cameras),
+        return self.stated(
+            robot.cameras,
+            list(parts),
+            self.model.horizon,
             state={part: StateSpec(dim) for part, dim in parts.items() if part not in (GRIPPER, CLOSED)},
-            gripper=needs_gripper(list(parts)),
             instruction=self.model.transforms.prompt,
             action=robot.action,
-            chunk=self.chunk(self.model.horizon),
-            history=1,
             behaviour=self.offered(OFFERED if self.config.noise_level else ()),
         )
 

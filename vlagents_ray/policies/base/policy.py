@@ -28,10 +28,13 @@ from vlagents_ray.policies.base.checkpoint_files import weights_of
 from vlagents_ray.policies.base.config import ModelConfig
 from vlagents_ray.policies.base.model_inputs import (
     Row,
+    camera_specs,
     count_in,
     drawn,
     leftover_plan,
+    needs_gripper,
     shared_frames,
+    state_specs,
     wanted_behaviour,
     wanted_samples,
 )
@@ -121,6 +124,25 @@ class ModelPolicy(Agent, abc.ABC):
     def chunk(self, horizon: int) -> int:
         """Return, for the contract, how many of the model's `horizon` rows an `act` returns."""
         return min(self.config.execute or horizon, horizon) if self.config.actions == "chunk" else 1
+
+    def stated(self, cameras: Mapping[str, str], parts: Sequence[str], horizon: int | None, **facts: Any) -> Contract:
+        """Return the contract of a model.
+
+        Args:
+            cameras: Its names of the cameras -> ours.
+            parts: The parts of its state vector, in order.
+            horizon: The rows of its chunks; None before they are known.
+            facts: Further fields of the contract, or other values of these.
+        """
+        usual: dict[str, Any] = {
+            "cameras": camera_specs(cameras),
+            "state": state_specs(parts, self.state_dim),
+            "gripper": needs_gripper(parts),
+            "instruction": True,
+            "chunk": None if horizon is None else self.chunk(horizon),
+            "history": self.history,
+        }
+        return Contract(**usual | facts)
 
     @abc.abstractmethod
     def load(self) -> Any:

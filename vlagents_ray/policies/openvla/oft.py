@@ -17,14 +17,7 @@ from vlagents_ray.errors import ConfigError, InvalidObservation
 from vlagents_ray.interface import Obs
 from vlagents_ray.policies.base import Row
 from vlagents_ray.policies.base.accelerator import fetch
-from vlagents_ray.policies.base.model_inputs import (
-    camera_images,
-    camera_specs,
-    choose_cameras,
-    needs_gripper,
-    state_specs,
-    state_vector,
-)
+from vlagents_ray.policies.base.model_inputs import camera_images, choose_cameras, needs_gripper, state_vector
 from vlagents_ray.policies.base.staging import StagedRow
 from vlagents_ray.policies.compilation import Compilation
 from vlagents_ray.policies.openvla.prismatic import (
@@ -88,16 +81,10 @@ class OpenVLAOFT(PrismaticPolicy):
 
     @property
     def contract(self) -> Contract:
-        return Contract(
-            cameras=camera_specs(self._cameras),
-            state=state_specs(self._state, self.state_dim),
-            gripper=needs_gripper(self._state) or None,
-            instruction=True,
-            action=self._action(),
-            chunk=self.chunk(self.config.horizon),
-            history=1,
-            behaviour=self.offered(OFFERED if self.config.head == "tokens" else ()),
-        )
+        gripper = needs_gripper(self._state) or None
+        behaviour = self.offered(OFFERED if self.config.head == "tokens" else ())
+        facts = {"action": self._action(), "gripper": gripper, "behaviour": behaviour}
+        return self.stated(self._cameras, self._state, self.config.horizon, **facts)
 
     @property
     def state_dim(self) -> int | None:

@@ -19,7 +19,7 @@ from vlagents_ray.contract import Contract
 from vlagents_ray.interface import Obs
 from vlagents_ray.policies.adapters import Adapters
 from vlagents_ray.policies.base import Row
-from vlagents_ray.policies.base.model_inputs import camera_images, camera_specs, choose_cameras
+from vlagents_ray.policies.base.model_inputs import camera_images, choose_cameras
 from vlagents_ray.policies.base.staging import StagedRow
 from vlagents_ray.policies.compilation import Compilation
 from vlagents_ray.policies.openvla.prismatic import (
@@ -63,15 +63,8 @@ class OpenVLA(PrismaticPolicy):
 
     @property
     def contract(self) -> Contract:
-        return Contract(
-            cameras=camera_specs(self._cameras),
-            state={},
-            instruction=True,
-            action=self._action(),
-            chunk=self.chunk(1),
-            history=1,
-            behaviour=self.offered(OFFERED),
-        )
+        facts = {"action": self._action(), "gripper": None, "behaviour": self.offered(OFFERED)}
+        return self.stated(self._cameras, (), 1, **facts)
 
     def load(self) -> TokenDecoder:
         base = load_prismatic(self.config)
