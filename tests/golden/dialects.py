@@ -133,8 +133,8 @@ def gateways() -> Iterator[Trace]:
         return ask("act", vlagents.write_observation({"arm": arm, "language_instruction": text}))
 
     old = '[{"cameras": {}, "camera_data_type": "raw", "gripper": 0.5, "info": {}}, "go", {"seed": 3}]'
-    ping = rpyc.request(8, rpyc.Handler.PING, rpyc.boxed_value(("hi",)))
-    look = rpyc.request(9, rpyc.Handler.INSPECT, rpyc.boxed_value(()))
+    ping = rpyc.request(8, rpyc.Handler.PING, (rpyc.VALUE, ("hi",)))
+    look = rpyc.request(9, rpyc.Handler.INSPECT, (rpyc.VALUE, ()))
     yield from scenario(
         "vlagents: calls",
         ("vlagents",),
