@@ -318,16 +318,15 @@ class Libero(SimulatorEnv):
         }
 
     def _begin(self, seed: int, state: int) -> tuple[Obs, dict[str, Any]]:
-        seen = self._env.begin(self._states[state])
-        return self._observe(seen), {"success": seen.success}
+        raw, success = self._env.begin(self._states[state])
+        return self._observe(raw), {"success": success}
 
     def _advance(self, action: np.ndarray) -> tuple[Obs, float, bool, dict[str, Any]]:
-        seen = self._env.step(to_simulator(action, self._rules), look=self.looked_at)
-        return self._observe(seen, look=self.looked_at), float(seen.success), *self._solved(seen.success)
+        raw, success = self._env.step(to_simulator(action, self._rules), look=self.looked_at)
+        return self._observe(raw, look=self.looked_at), float(success), *self._solved(success)
 
-    def _observe(self, seen: SimulatorObs, *, look: bool = True) -> Obs:
+    def _observe(self, raw: Mapping[str, Any], *, look: bool = True) -> Obs:
         cameras = self._rules.cameras if look else {}
-        raw = seen.raw
         state = {
             "xyz_axis_angle": np.concatenate([raw["robot0_eef_pos"], axis_angle(raw["robot0_eef_quat"])]),
             "gripper_qpos": raw["robot0_gripper_qpos"],
@@ -400,16 +399,11 @@ def axis_angle(quaternion: np.ndarray) -> np.ndarray:
     return turned
 
 
-@dataclass(frozen=True, slots=True)
-class SimulatorObs:
-    """The simulator's observation after a step."""
-
-    raw: Mapping[str, Any]  # robosuite's observation
-    success: bool
-
-
 class LiberoSimulation:
-    """Steps the simulator by the protocol, and renders only images that are used."""
+    """Steps the simulator by the protocol, and renders only images that are used.
+
+    `begin` and `step` return robosuite's observation, and whether the task is solved.
+    """
 
     def __init__(self, task: LiberoTask, protocol: LiberoProtocol, assets: Path) -> None:
         self._package: Any = require("libero.libero")
@@ -427,7 +421,7 @@ class LiberoSimulation:
         )
         self._cameras = CameraRenderer(self._env.env)
 
-    def begin(self, state: np.ndarray) -> SimulatorObs:
+    def begin(self, state: np.ndarray) -> tuple[Mapping[str, Any], bool]:
         """Seed, reset, set the initial `state`, (D,) float64, and let the objects settle."""
         settling = self._protocol.settling_steps
         self._use_assets()
@@ -442,18 +436,13 @@ class LiberoSimulation:
                 self._cameras.open = i == settling - 1
                 raw, _, success, _ = self._env.step(list(self._protocol.settling_action))
         self._cameras.open = True
-        return SimulatorObs(raw, bool(success))
+        return raw, bool(success)
 
-    def step(self, action: np.ndarray, *, look: bool = True) -> SimulatorObs:
+    def step(self, action: np.ndarray, *, look: bool = True) -> tuple[Mapping[str, Any], bool]:
         """Execute an action, (7,) float64, clipped to [-1, 1] by the controller; without `look`, render nothing."""
         self._cameras.open = look
         raw, _, success, _ = self._env.step(action)
-        return SimulatorObs(raw, bool(success))
-
-    @property
-    def goal(self) -> list[list[str]]:
-        """The goal's predicates, all of which must hold, e.g. [["on", "akita_black_bowl_1", "plate_1"]]."""
-        return [[str(word) for word in predicate] for predicate in self._env.env.parsed_problem["goal_state"]]
+        return raw, bool(success)
 
     def sim_state(self) -> dict[str, Any]:
         """Return `Libero`'s `sim_state`, for scripted experts."""
@@ -467,7 +456,7 @@ class LiberoSimulation:
             "quaternions": {
                 name: np.roll(poses[name]["quat"], -1) for name in poses if states[name].object_state_type == "object"
             },
-            "goal": self.goal,
+            "goal": [[str(word) for word in one] for one in goal],  # e.g. ["on", "akita_black_bowl_1", "plate_1"]
             "unmet": [[str(word) for word in one] for one in goal if not domain._eval_predicate(one)],
         }
 
