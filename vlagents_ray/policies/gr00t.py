@@ -202,7 +202,8 @@ class Gr00tNetwork:
         dtype = torch_dtype(config.dtype, device)
         other = {} if config.backbone is None else {"model_name": config.backbone}
         transformers = require("transformers")
-        flash = flash_attention_is_here(device, dtype)
+        computes = device.type == "cuda" and dtype.itemsize == 2  # flash-attention, if it is installed
+        flash = computes and bool(require("transformers.utils").is_flash_attn_2_available())
         with (
             remote_code(allowed=config.trust_remote_code, source=code),
             contextlib.nullcontext() if flash else built_without_flash_attention(),
@@ -342,12 +343,6 @@ def _require_version(folder: Path) -> None:
 
 _FLASH, _PACKED = "flash_attention_2", "packed_sdpa"
 _CHECK = "_check_and_enable_flash_attn_2"  # a method of transformers' models, up to 4.5
-
-
-def flash_attention_is_here(device: Any, dtype: Any) -> bool:
-    """Return whether flash-attention is installed and supports the device and dtype: CUDA, 16 bits."""
-    computes = device.type == "cuda" and dtype.itemsize == 2
-    return computes and bool(require("transformers.utils").is_flash_attn_2_available())
 
 
 @contextlib.contextmanager

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib
+import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass, replace
@@ -186,7 +187,7 @@ def _renamed(saved: Mapping[str, Any]) -> dict[str, Any]:
     return tensors
 
 
-_PREFIXES = ("module.", "backbone.")  # added by distributed training and upstream's wrapper
+_PREFIXES = re.compile(r"module\.|backbone\.")  # added by distributed training and upstream's wrapper
 
 
 def read_checkpoint(config: VJepa2AcConfig) -> dict[str, dict[str, Any]]:
@@ -205,7 +206,11 @@ def read_checkpoint(config: VJepa2AcConfig) -> dict[str, dict[str, Any]]:
         raise ConfigError(
             f"checkpoint {file}: got {got}, want 'predictor' among them; is it V-JEPA 2-AC's, and not V-JEPA 2's?"
         )
-    return {name: _clean(part) for name, part in parts.items() if isinstance(part, Mapping)}
+    return {
+        name: {_PREFIXES.sub("", str(key)): tensor for key, tensor in part.items()}
+        for name, part in parts.items()
+        if isinstance(part, Mapping)
+    }
 
 
 def load_predictor(config: VJepa2AcConfig, saved: Mapping[str, Any], width: int) -> Any:
@@ -262,15 +267,6 @@ def _only(folder: Path) -> Path:
     return files[0]
 
 
-def _clean(part: Mapping[str, Any]) -> dict[str, Any]:
-    cleaned = {}
-    for name, tensor in part.items():
-        for prefix in _PREFIXES:
-            name = str(name).replace(prefix, "")  # noqa: PLW2901 - step by step
-        cleaned[str(name)] = tensor
-    return cleaned
-
-
 Tensor = Any  # torch's
 World = Callable[[Tensor, Tensor, Tensor], Tensor]
 """Predicts the next frame's features (M, N, F) from features (M, T, N, F), actions (M, T, 7) and poses (M, T, 7)."""
@@ -304,8 +300,8 @@ def plan(world: World, features: Tensor, poses: Tensor, goals: Tensor, noise: Te
     mean = torch.zeros(len(poses), config.rollout, DRAWN, device=poses.device)
     std = torch.ones_like(mean)
     std[..., :3] = config.maxnorm
-    keep_mean = _momentum(mean, config.momentum_mean, config.momentum_mean_gripper)
-    keep_std = _momentum(mean, config.momentum_std, config.momentum_std_gripper)
+    keep_mean = mean.new_tensor([config.momentum_mean] * 3 + [config.momentum_mean_gripper])
+    keep_std = mean.new_tensor([config.momentum_std] * 3 + [config.momentum_std_gripper])
     energy = torch.zeros(len(poses), 0)
     for draws in noise.unbind(1):
         tried = _bounded(draws * std[:, :, None] + mean[:, :, None], config)  # (B, H, S, 4)
@@ -317,10 +313,6 @@ def plan(world: World, features: Tensor, poses: Tensor, goals: Tensor, noise: Te
     gripper = mean[..., 3:]
     rested = torch.cat([mean[..., :3], torch.where(gripper.abs() < _GRIPPER_REST, 0.0, gripper)], -1)
     return Plans(_actions(rested), _actions(std), energy.min(1).values)
-
-
-def _momentum(like: Tensor, position: float, gripper: float) -> Tensor:
-    return like.new_tensor([position] * 3 + [gripper])
 
 
 def _bounded(tried: Tensor, config: VJepa2AcConfig) -> Tensor:

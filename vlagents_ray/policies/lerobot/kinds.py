@@ -118,11 +118,9 @@ class Diffusion(Kind):
     def __init__(self, policy: Any, compilation: Compilation) -> None:
         super().__init__(policy, compilation)
         unet = policy.diffusion.unet
-        self._denoise, self._encode = (
-            compilation.core("denoise", unet.forward),
-            compilation.core("vision encoder", self._condition),
-        )
-        unet.forward = self._forward
+        denoise = compilation.core("denoise", unet.forward)
+        self._encode = compilation.core("vision encoder", self._condition)
+        unet.forward = lambda sample, times, global_cond: denoise(sample, times, global_cond)  # noqa: PLW0108 - named
 
     @property
     def horizon(self) -> int:
@@ -140,9 +138,6 @@ class Diffusion(Kind):
             noise=self.staging.upload(noise),
         )
         return actions[:, self.steps - 1 :]
-
-    def _forward(self, sample: Any, times: Any, global_cond: Any) -> Any:
-        return self._denoise(sample, times, global_cond)
 
     def _condition(self, *inputs: Any) -> Any:
         names = [*vectors(self.config), *([IMAGES] if self.config.image_features else [])]
@@ -247,30 +242,23 @@ class Guidance:
             convert: Makes a tensor of an array, on the policy's device.
         """
         torch = require("torch")
+        settings = self._processor.rtc_config
         target, weights = torch.zeros(len(plans), *shape), torch.zeros(len(plans), shape[0], 1)
         for i, (plan, delay) in enumerate(zip(plans, delays, strict=True)):
             if plan is not None:
                 part = plan[: shape[0]]
                 target[i, : len(part), : part.shape[1]] = part
-                weights[i, :, 0] = self._weights(delay, len(part), shape[0])
+                horizon = min(settings.execution_horizon, len(part))
+                weights[i, :, 0] = self._processor.get_prefix_weights(max(delay, 0), horizon, shape[0])
         target, weights = convert(target.numpy()), convert(weights.numpy())
+        most = float(settings.max_guidance_weight)
 
         def change(velocity: Any, actions: Any, time: float) -> Any:
-            end = actions - time * velocity
-            return velocity - self._strength(time) * weights * (target - end)
+            end, done = actions - time * velocity, 1 - time
+            strength = most if done == 0 else min(most, time / done * (time**2 + done**2) / time**2)
+            return velocity - strength * weights * (target - end)
 
         return change
-
-    def _weights(self, delay: int, leftover: int, chunk: int) -> Any:
-        """Return the weight of the leftover in each row of a chunk, (chunk,) float32 in [0, 1]."""
-        horizon = min(self._processor.rtc_config.execution_horizon, leftover)
-        return self._processor.get_prefix_weights(max(delay, 0), horizon, chunk)
-
-    def _strength(self, time: float) -> float:
-        """Return the guidance strength g for LeRobot's time, which runs from 1 (noise) to 0."""
-        most = float(self._processor.rtc_config.max_guidance_weight)
-        done = 1 - time
-        return most if done == 0 else min(most, time / done * (time**2 + done**2) / time**2)
 
 
 class SmolVLAPasses(FlowPasses):
@@ -359,15 +347,12 @@ class Groot(Kind):
 
     @property
     def horizon(self) -> int:
-        return int(self.policy._resolve_prediction_horizon(require("torch").empty(1, self._longest, 1)))
+        longest = int(self.policy._groot_model.config.action_horizon)
+        return int(self.policy._resolve_prediction_horizon(require("torch").empty(1, longest, 1)))
 
     @property
     def usual(self) -> int:
         return min(int(self.policy._action_queue_steps), self.horizon)
-
-    @property
-    def _longest(self) -> int:
-        return int(self.policy._groot_model.config.action_horizon)
 
     def draw(self, batch: dict[str, Any], rows: Sequence[Row], leftovers: Sequence[Any]) -> Any:
         from vlagents_ray.policies.sampling_rng import RowDraws

@@ -10,7 +10,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from vlagents_ray.contract import ActionSpec, CameraSpec, Contract, StateSpec
+from vlagents_ray.contract import ActionSpec, CameraSpec, Contract
 from vlagents_ray.dataset_contract import DatasetContract, angles_in, centre_between, usual_unit
 from vlagents_ray.errors import ConfigError
 from vlagents_ray.interface import Obs
@@ -135,11 +135,14 @@ class LeRobot(ModelPolicy):
         processors.require_statistics(settings, inputs)
         environment = list(trained.environment or [ENVIRONMENT_STATE]) if settings.env_state_feature else []
         width = processors.width(kind.dim)
-        action = trained.contract.action
+        action, known = trained.contract.action, trained.contract.state or {}
+        state = state_specs(parts, settings.robot_state_feature.shape[0]) if parts else {}
+        if tuple(parts) == trained.state:
+            state |= known
+        around = state_specs(environment, settings.env_state_feature.shape[0]) if environment else {}
         contract = Contract(
             cameras={ours: _camera(settings, key) for key, ours in cameras.items()},
-            state=_states(parts, settings.robot_state_feature, trained)
-            | _environment_states(environment, settings.env_state_feature, trained),
+            state=state | {part: known.get(part, spec) for part, spec in around.items()},
             gripper=needs_gripper(parts),
             instruction=processors.instructed or None,
             action=action if action.dim == width else ActionSpec(dim=width),
@@ -272,10 +275,13 @@ def _of_features(features: Iterable[str], processors: Processors) -> DatasetCont
     whole = processors.statistics(STATE)
     parts = {part: processors.statistics(key) for part, key in keys.items()}
     listed = [part for key in features for part, own in keys.items() if own == key]
+
+    def alike(name: str) -> bool:
+        values, wanted = np.concatenate([parts[part].get(name, []) for part in order]), whole.get(name, [])
+        return len(values) == len(wanted) and np.allclose(values, wanted, rtol=1e-5, atol=1e-6)
+
     for order in (listed, sorted(keys, key=lambda part: (part == GRIPPER, part))):
-        if order and all(
-            _alike([parts[part].get(name, []) for part in order], whole.get(name, [])) for name in _MATCHED
-        ):
+        if order and all(map(alike, _MATCHED)):
             break
     else:
         return DatasetContract(Contract())
@@ -288,11 +294,6 @@ def _of_features(features: Iterable[str], processors: Processors) -> DatasetCont
                 angles[place + i] = centre
         place += width
     return DatasetContract(Contract(), tuple(order), angles=angles)
-
-
-def _alike(parts: Sequence[Sequence[float]], whole: Sequence[float]) -> bool:
-    values = np.concatenate(parts)
-    return len(values) == len(whole) and np.allclose(values, whole, rtol=1e-5, atol=1e-6)
 
 
 def _cameras(
@@ -324,16 +325,3 @@ def _camera(settings: Any, key: str) -> CameraSpec:
         return CameraSpec()
     _, height, width = settings.input_features[key].shape
     return CameraSpec(height, width)
-
-
-def _states(parts: Sequence[str], feature: Any, trained: DatasetContract) -> dict[str, StateSpec]:
-    specs = state_specs(parts, feature.shape[0]) if parts else {}
-    if tuple(parts) == trained.state:
-        specs |= trained.contract.state or {}
-    return specs
-
-
-def _environment_states(parts: Sequence[str], feature: Any, trained: DatasetContract) -> dict[str, StateSpec]:
-    specs = state_specs(parts, feature.shape[0]) if parts else {}
-    known = trained.contract.state or {}
-    return {part: known.get(part, spec) for part, spec in specs.items()}
