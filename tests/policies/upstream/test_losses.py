@@ -19,7 +19,7 @@ from websockets.exceptions import ConnectionClosedError
 from vlagents_ray.errors import NoReplica, PolicyUnavailable, UnknownSession
 from vlagents_ray.evaluate import EvalConfig
 from vlagents_ray.interface import Obs
-from vlagents_ray.policies.upstream import Upstream, client
+from vlagents_ray.policies.upstream import Upstream, websocket
 from vlagents_ray.serve.models.agent_copies import AgentCopies
 from vlagents_ray.serve.ports import free_port
 
@@ -127,7 +127,7 @@ def test_a_connection_that_ends_in_its_handshake_is_tried_again(
 ) -> None:
     port, refused = free_port(), []
     start(port)
-    real = client.connect
+    real = websocket.connect
 
     def connect(*args: Any, **options: Any) -> Any:
         if len(refused) < 2:
@@ -135,7 +135,7 @@ def test_a_connection_that_ends_in_its_handshake_is_tried_again(
             raise ConnectionClosedError(None, None)  # as when the upstream is killed in the meantime
         return real(*args, **options)
 
-    monkeypatch.setattr(client, "connect", connect)
+    monkeypatch.setattr(websocket, "connect", connect)
     agent = opened(port)
     assert len(refused) == 2
     require_right(agent, sessions(agent, 1))

@@ -20,10 +20,9 @@ from vlagents_ray.interface import Act, Agent, Obs
 from vlagents_ray.policies.upstream.client import ClientOptions, UpstreamClient
 from vlagents_ray.policies.upstream.connections import Lanes, SessionConnections
 from vlagents_ray.policies.upstream.gr00t import GR00TClient
-from vlagents_ray.policies.upstream.openpi import OpenPiBatchClient, OpenPiClient, RoboArenaClient
 from vlagents_ray.policies.upstream.openvla import OpenVLAClient
-from vlagents_ray.policies.upstream.vla_eval import VlaEvalClient
 from vlagents_ray.policies.upstream.vlagents import VlagentsClient
+from vlagents_ray.policies.upstream.websocket import OpenPiBatchClient, OpenPiClient, RoboArenaClient, VlaEvalClient
 from vlagents_ray.wire.mapping import KeyMapping
 from vlagents_ray.wire.outgoing import Outgoing
 from vlagents_ray.wire.presets import read_mapping
