@@ -26,6 +26,7 @@ from vlagents_ray.policies.base.checkpoint import SavedTensors, find_checkpoint,
 from vlagents_ray.policies.base.model_code import remote_code, use_source
 from vlagents_ray.policies.base.model_inputs import GRIPPER, camera_images, choose_cameras, state_vector
 from vlagents_ray.policies.compilation import Compilation
+from vlagents_ray.policies.outcomes import attempt, of_good
 from vlagents_ray.registry import require
 
 CONFIG, STATISTICS = "processor_config.json", "statistics.json"
@@ -489,34 +490,23 @@ class Gr00t(ModelPolicy):
 
     def predict(self, rows: Sequence[Row]) -> list[Prediction | Exception]:
         """Compute the chunks of all rows whose observations GR00T's processor accepts."""
-        read = [self._inputs(row) for row in rows]
-        places = [place for place, one in enumerate(read) if not isinstance(one, Exception)]
-        found: list[Prediction | Exception] = list(read)  # type: ignore[arg-type]  # what is no error is replaced
-        if places:
-            chunks = self.loaded().chunks(
-                [rows[place].rng for place in places],
-                [read[place] for place in places],
-            )
-            for place, chunk in zip(places, chunks, strict=True):
-                found[place] = Prediction(chunk)
-        return found
 
-    def _inputs(self, row: Row) -> dict[str, Any] | Exception:
-        """Return the model's inputs of a row, or an exception for its session."""
+        def compute(good: list[tuple[np.random.Generator, dict[str, Any]]]) -> list[Prediction]:
+            return [Prediction(chunk) for chunk in self.loaded().chunks(*zip(*good, strict=True))]
+
+        return of_good([attempt(self._inputs, row) for row in rows], compute)
+
+    def _inputs(self, row: Row) -> tuple[np.random.Generator, dict[str, Any]]:
+        """Return the random generator and the model's inputs of a row."""
         newest = row.frames[-1]
         if newest.inputs is not None:
-            return newest.inputs  # type: ignore[no-any-return]
+            return row.rng, newest.inputs
         network: Gr00tNetwork = self.loaded()
         frames = row.history(self.history)
         moments = network.embodiment.moments
-        try:
-            return network.inputs(
-                [frames[moment - 1].images for moment in moments["video"]],
-                [frames[moment - 1].state for moment in moments["state"]],
-                row.instruction,
-            )
-        except Exception as error:  # noqa: BLE001 - returned to the session of the observation
-            return error
+        images = [frames[moment - 1].images for moment in moments["video"]]
+        state = [frames[moment - 1].state for moment in moments["state"]]
+        return row.rng, network.inputs(images, state, row.instruction)
 
     def _parts(self, robot: Embodiment) -> dict[str, int | None]:
         """Return the parts of our state that form the model's, with their widths if known."""

@@ -31,6 +31,7 @@ from vlagents_ray.policies.base.accelerator import ensure_torchvision, fetch, to
 from vlagents_ray.policies.base.checkpoint import SavedTensors, find_checkpoint, require_loaded
 from vlagents_ray.policies.base.model_inputs import keeping_tokens
 from vlagents_ray.policies.base.staging import StagedRow, Staging
+from vlagents_ray.policies.outcomes import attempt, of_good
 from vlagents_ray.registry import require
 
 Bounds = Literal["q99", "min_max"]  # of each dimension: 1st and 99th percentile, or minimum and maximum
@@ -461,20 +462,14 @@ class PrismaticPolicy(ModelPolicy):
         return info
 
     def predict(self, rows: Sequence[Row]) -> list[Prediction | Exception]:
-        results: dict[int, Prediction | Exception] = {}
-        prepared: dict[int, PreparedRow] = {}
-        for i, row in enumerate(rows):
-            try:
-                key = self._key(row)
-                scale = self._statistics(row.adapter).scale(key)
-                prepared[i] = PreparedRow(row, scale, self._model_input(row, key))
-            except Exception as error:  # noqa: BLE001 - handed to the session whose request failed
-                results[i] = error
-        entries = list(prepared.values())
-        answers = self._compute(entries) if entries else []
-        for (i, entry), answer in zip(prepared.items(), answers, strict=True):
-            results[i] = answer.prediction(entry.scale)
-        return [results[i] for i in range(len(rows))]
+        def prepare(row: Row) -> PreparedRow:
+            key = self._key(row)
+            return PreparedRow(row, self._statistics(row.adapter).scale(key), self._model_input(row, key))
+
+        def compute(good: list[PreparedRow]) -> list[Prediction]:
+            return [chunk.prediction(one.scale) for one, chunk in zip(good, self._compute(good), strict=True)]
+
+        return of_good([attempt(prepare, row) for row in rows], compute)
 
     def _example(self, seed: int, instruction: str = "warm up") -> Row:
         """Return a row of any dataset; sessions may select theirs later."""
