@@ -398,14 +398,9 @@ class RemoteAgent(Agent):
         return found
 
     def _call(self, sessions: Sequence[ClientSession], requests: Sequence[Request], timeout_s: float) -> list[Reply]:
-        if self._tracer is not None:
-            return self._traced(requests, lambda: self._send(sessions, requests, timeout_s))
-        return self._send(sessions, requests, timeout_s)
-
-    def _send(self, sessions: Sequence[ClientSession], requests: Sequence[Request], timeout_s: float) -> list[Reply]:
-        if self._resume:
-            return call_with_recovery(self._connection, sessions, requests, timeout_s)
-        return self._connection.call(requests, timeout_s)
+        call = partial(call_with_recovery, self._connection, sessions) if self._resume else self._connection.call
+        send = partial(call, requests, timeout_s)
+        return send() if self._tracer is None else self._traced(requests, send)
 
     def _traced(self, requests: Sequence[Request], send: Callable[[], list[Reply]]) -> list[Reply]:
         """Send one message within a span, a child of the caller's if there is one and the parent of the server's."""

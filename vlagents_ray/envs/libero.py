@@ -29,9 +29,10 @@ from typing import Any, ClassVar, Literal
 import numpy as np
 
 from vlagents_ray.contract import CameraSpec, Contract, StateSpec
+from vlagents_ray.envs.base import DELTA_POSE
 from vlagents_ray.envs.graphics import prepare_rendering
 from vlagents_ray.envs.render_probe import failing
-from vlagents_ray.envs.robosuite import OSC_POSE, CameraRenderer, gripper_opening, importing_robosuite, seeded
+from vlagents_ray.envs.robosuite import CameraRenderer, gripper_opening, importing_robosuite, seeded
 from vlagents_ray.envs.simulator import SimulatorEnv
 from vlagents_ray.errors import ConfigError, EnvFailed, MissingDependency, UnknownEnv
 from vlagents_ray.interface import Obs
@@ -355,7 +356,7 @@ def _contract_of(protocol: LiberoProtocol) -> Contract:
         },
         gripper=True,
         instruction=True,
-        action=replace(OSC_POSE, gripper_open=protocol.gripper_open, gripper_closed=protocol.gripper_closed),
+        action=replace(DELTA_POSE, gripper_open=protocol.gripper_open, gripper_closed=protocol.gripper_closed),
         control_hz=protocol.control_hz,
     )
 

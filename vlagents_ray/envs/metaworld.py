@@ -12,8 +12,8 @@ from typing import Any
 
 import numpy as np
 
-from vlagents_ray.contract import ActionSpec, CameraSpec, Contract, StateSpec
-from vlagents_ray.envs.base import require_cameras
+from vlagents_ray.contract import CameraSpec, Contract, StateSpec
+from vlagents_ray.envs.base import DELTA_POSE, require_cameras
 from vlagents_ray.envs.graphics import prepare_rendering
 from vlagents_ray.envs.simulator import BenchmarkProtocol, MujocoCameras, SimulatorEnv, camera_names
 from vlagents_ray.errors import ConfigError
@@ -119,17 +119,7 @@ class MetaWorld(SimulatorEnv):
             state={"xyz": StateSpec(3, "m")},
             gripper=True,
             instruction=True,
-            action=ActionSpec(
-                dim=4,
-                space="ee_position",
-                delta=True,
-                rotation="none",
-                frame="world",
-                gripper_open=-1.0,
-                gripper_closed=1.0,
-                low=-1.0,
-                high=1.0,
-            ),
+            action=replace(DELTA_POSE, dim=4, space="ee_position", rotation="none", frame="world"),
         )
 
     @classmethod

@@ -19,8 +19,9 @@ from typing import Any, Literal, get_args
 import numpy as np
 
 from vlagents_ray.contract import CameraSpec, Contract, StateSpec
+from vlagents_ray.envs.base import DELTA_POSE
 from vlagents_ray.envs.render_probe import failing
-from vlagents_ray.envs.robosuite import OSC_POSE, RobosuiteEnv, importing_robosuite, seeded
+from vlagents_ray.envs.robosuite import RobosuiteEnv, importing_robosuite, seeded
 from vlagents_ray.envs.simulator import BenchmarkProtocol
 from vlagents_ray.errors import ConfigError, EnvFailed
 from vlagents_ray.interface import Obs
@@ -236,7 +237,7 @@ class RoboCasa(RobosuiteEnv):
             gripper=True,
             instruction=True,
             action=replace(
-                OSC_POSE if last else replace(OSC_POSE, gripper_open=None, gripper_closed=None),
+                DELTA_POSE if last else replace(DELTA_POSE, gripper_open=None, gripper_closed=None),
                 dim=12,
                 space="base_velocity+ee_pose" if last else "ee_pose+base_velocity",
             ),

@@ -18,7 +18,8 @@ from typing import Any
 
 import numpy as np
 
-from vlagents_ray.contract import ActionSpec, CameraSpec, Contract, StateSpec
+from vlagents_ray.contract import CameraSpec, Contract, StateSpec
+from vlagents_ray.envs.base import DELTA_POSE
 from vlagents_ray.envs.graphics import EGL_DEVICE, GPUS
 from vlagents_ray.envs.render_probe import EGL_CURE
 from vlagents_ray.envs.simulator import BenchmarkProtocol, SimulatorEnv, Size
@@ -27,18 +28,6 @@ from vlagents_ray.interface import Obs
 from vlagents_ray.registry import require
 
 _OPEN_M = 0.04  # m, travel of a finger from closed to open
-OSC_POSE = ActionSpec(
-    dim=7,
-    space="ee_pose",
-    delta=True,
-    rotation="axis_angle",
-    frame="base",
-    gripper_open=-1.0,
-    gripper_closed=1.0,
-    low=-1.0,
-    high=1.0,
-)
-"""An action of robosuite's controller for one arm with a gripper."""
 
 
 class RobosuiteEnv(SimulatorEnv):
@@ -317,7 +306,7 @@ class Robosuite(RobosuiteEnv):
             state={f"{arm}_{part}": spec for arm in task.arms for part, spec in parts.items()},
             gripper=len(task.arms) == 1,
             instruction=True,
-            action=replace(OSC_POSE, dim=7 * len(task.arms), arms=task.arms if len(task.arms) > 1 else None),
+            action=replace(DELTA_POSE, dim=7 * len(task.arms), arms=task.arms if len(task.arms) > 1 else None),
             control_hz=CONTROL_HZ,
         )
 

@@ -120,7 +120,6 @@ class ManiSkill(SimulatorEnv):
 
     @classmethod
     def missing(cls) -> str | None:
-        """Return why ManiSkill cannot run here; the first call in a process renders one frame in a child process."""
         if missing := without(("mani_skill", "sapien", "gymnasium", "torch"), "pip install 'vlagents-ray[maniskill]'"):
             return missing
         probe = render_probe()
