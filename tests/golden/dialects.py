@@ -61,11 +61,11 @@ def documents() -> Iterator[Trace]:
     """OpenVLA's, over HTTP."""
 
     def post(body: Any, session: str = "") -> tuple[bytes]:
-        data = body if isinstance(body, bytes) else openvla.encode_observation(body)
+        data = body if isinstance(body, bytes) else openvla.encode(body)
         return (http("POST", "/act", data, "application/json", session),)
 
     seen = {"image": PIXELS, "instruction": "pick"}
-    twice = {"encoded": openvla.encode_observation(seen).decode()}
+    twice = {"encoded": openvla.encode(seen).decode()}
     lone = asks(*map(post, [seen, twice, without(seen, "image"), without(seen, "instruction")]))
     kept = asks(post(seen, "s-1"), post(seen, "s-1"), post(seen | {"instruction": "place it"}, "s-1"))
     wrong = [seen | {"instruction": "fail"}, seen | {"image": PIXELS[0]}, b"{", b"[]", bytes(5000)]

@@ -246,15 +246,17 @@ def read_observation_part(message: bytes) -> ObservationPart:
 
 def read_data(message: bytes) -> memoryview | None:
     """Return the pickle in a `PolicySetup` or an `Actions`; None if it has none."""
-    for field, value in _protobuf_fields(message):
-        if field == 1 and isinstance(value, memoryview):
-            return value
-    return None
+    fields = _protobuf_fields(message)
+    return next((value for field, value in fields if field == 1 and isinstance(value, memoryview)), None)
 
 
 def write_data(data: bytes) -> bytes:
     """Return a `PolicySetup` or an `Actions` with a pickle."""
-    return _head(1, len(data)) + data
+    size, length = bytearray(), len(data)
+    while length > 0x7F:
+        size.append(length & 0x7F | 0x80)
+        length >>= 7
+    return bytes([1 << 3 | _BYTES, *size, length]) + data
 
 
 def method(name: str) -> str:
@@ -262,14 +264,6 @@ def method(name: str) -> str:
 
 
 EMPTY = b""  # an `Empty`, and an `Actions` without a pickle
-
-
-def _head(number: int, length: int) -> bytes:
-    size = bytearray()
-    while length > 0x7F:
-        size.append(length & 0x7F | 0x80)
-        length >>= 7
-    return bytes([number << 3 | _BYTES, *size, length])
 
 
 def _protobuf_fields(message: bytes) -> Iterator[tuple[int, int | memoryview]]:

@@ -6,6 +6,7 @@ its `reset`. A camera is an array, a JPEG file in base64, or the name of a share
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Protocol
@@ -206,9 +207,7 @@ def _shared(payload: Mapping[str, Any], budget: Budget, segments: Segments) -> n
         raise MalformedMessage("shared memory: want a name, and pixels of uint8")
     if not (isinstance(shape, list) and 0 < len(shape) <= 4 and all(type(n) is int and n > 0 for n in shape)):
         raise MalformedMessage(f"shared memory: got the shape {shown(shape)}, want (H, W, 3)")
-    size = 1
-    for n in shape:
-        size *= n
+    size = math.prod(shape)
     if size > budget.limits.body_bytes:
         raise MessageTooLarge(f"shared memory: got {size} bytes, the limit is {budget.limits.body_bytes}")
     budget.hold(size)
