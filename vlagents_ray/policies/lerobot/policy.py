@@ -37,6 +37,7 @@ from vlagents_ray.policies.lerobot.kinds import (
     Kind,
 )
 from vlagents_ray.policies.lerobot.processors import STATE, Processors, own_processors
+from vlagents_ray.policies.outcomes import attempt
 from vlagents_ray.registry import require
 
 log = logging.getLogger(__name__)
@@ -185,25 +186,15 @@ class LeRobot(ModelPolicy):
         return model.kind.staging.stage(frame)
 
     def predict(self, rows: Sequence[Row]) -> list[Prediction | Exception]:
-        predictions: dict[int, Prediction | Exception] = {}
-        for members in self._groups(rows):
-            drawn: list[Prediction | Exception] = []
-            try:
-                drawn += self._draw([rows[i] for i in members])
-            except Exception as error:
-                if self.model.kind.batched:
-                    raise
-                drawn.append(error)  # fails only that session
-            predictions |= zip(members, drawn, strict=True)
-        return [predictions[i] for i in range(len(rows))]
-
-    def _groups(self, rows: Sequence[Row]) -> list[list[int]]:
-        if not self.model.kind.batched:
-            return [[i] for i in range(len(rows))]
+        if not self.model.kind.batched:  # an error fails only its session
+            return [attempt(lambda row: self._draw([row])[0], row) for row in rows]
         groups: dict[Any, list[int]] = {}
         for i, row in enumerate(rows):
             groups.setdefault(tuple(array.shape for array in row.frames[-1].values()), []).append(i)
-        return list(groups.values())
+        drawn = {}
+        for members in groups.values():
+            drawn |= zip(members, self._draw([rows[i] for i in members]), strict=True)
+        return [drawn[i] for i in range(len(rows))]
 
     def _draw(self, rows: list[Row]) -> list[Prediction]:
         torch, model = require("torch"), self.model
