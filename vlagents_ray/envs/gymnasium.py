@@ -7,7 +7,6 @@ of `Gymnasium`.
 
 from __future__ import annotations
 
-import importlib.util
 import os
 import re
 from collections.abc import Mapping
@@ -19,6 +18,7 @@ import numpy as np
 from vlagents_ray.contract import ActionSpec, CameraSpec, Contract, StateSpec
 from vlagents_ray.envs.base import EvalEnv, one_row, require_known
 from vlagents_ray.envs.graphics import prepare_rendering
+from vlagents_ray.envs.render_probe import without
 from vlagents_ray.envs.simulator import BenchmarkProtocol
 from vlagents_ray.errors import ConfigError, EnvFailed, MissingDependency, NotReset, UnknownEnv, VLAgentsError
 from vlagents_ray.interface import Act, Obs
@@ -349,9 +349,7 @@ class PushT(Gymnasium):
 
     @classmethod
     def missing(cls) -> str | None:
-        if importlib.util.find_spec("gym_pusht") is None:
-            return "gym_pusht is not installed; pip install 'vlagents-ray[pusht]'"
-        return None
+        return without(("gym_pusht",), "pip install 'vlagents-ray[pusht]'")
 
     def _observe(self, nested: Any) -> Obs:
         obs = super()._observe(nested)

@@ -15,7 +15,7 @@ from typing_extensions import Self
 from vlagents_ray.contract import Contract
 from vlagents_ray.errors import ConfigError, InvalidObservation
 from vlagents_ray.interface import Obs
-from vlagents_ray.policies.base import Row
+from vlagents_ray.policies.base import Prediction, Row
 from vlagents_ray.policies.base.accelerator import fetch
 from vlagents_ray.policies.base.model_inputs import camera_images, choose_cameras, needs_gripper, state_vector
 from vlagents_ray.policies.base.staging import StagedRow
@@ -23,7 +23,6 @@ from vlagents_ray.policies.compilation import Compilation
 from vlagents_ray.policies.openvla.prismatic import (
     OFFERED,
     Bounds,
-    DecodedChunk,
     PreparedRow,
     Prismatic,
     PrismaticConfig,
@@ -146,21 +145,21 @@ class OpenVLAOFT(PrismaticPolicy):
         proprio = None if state is None else base.statistics.scale(key, "proprio").normalise(state)
         return ModelInput(seen, base.tokens(row.instruction), proprio)
 
-    def _compute(self, prepared: Sequence[PreparedRow]) -> list[DecodedChunk]:
+    def _compute(self, prepared: Sequence[PreparedRow]) -> list[Prediction]:
         """Run one forward pass, or one per diffusion step. Regression gives a session's samples the same answer."""
         firsts, owners = self.observations_of([entry.row for entry in prepared])
         inputs = [prepared[i].model_input for i in firsts]
         shape = (self.model.horizon, self.model.dim)
+        if self.config.head == "tokens":
+            draws = np.stack(
+                [entry.row.rng.random(shape) if entry.row.sample else np.full(shape, np.nan) for entry in prepared]
+            )
+            return self._decoded(self.model.base.bins, prepared, *self.model.choose(inputs, owners, draws))
         if self.config.head == "l1":
-            answers = self.model.regress(inputs)
-            return [DecodedChunk(answers[owner]) for owner in owners]
-        if self.config.head == "diffusion":
-            noise = np.stack([entry.row.noise(*shape) for entry in prepared])
-            return [DecodedChunk(chunk) for chunk in self.model.denoise(inputs, owners, noise)]
-        draws = np.stack(
-            [entry.row.rng.random(shape) if entry.row.sample else np.full(shape, np.nan) for entry in prepared]
-        )
-        return self._decoded(self.model.base.bins, prepared, *self.model.choose(inputs, owners, draws))
+            chunks = self.model.regress(inputs)[owners]
+        else:
+            chunks = self.model.denoise(inputs, owners, np.stack([entry.row.noise(*shape) for entry in prepared]))
+        return [Prediction(entry.scale.restore(chunk)) for entry, chunk in zip(prepared, chunks, strict=True)]
 
 
 def _action_dim(statistics: Statistics, unnorm_key: str | None, head: Mlp | None) -> int:

@@ -418,24 +418,6 @@ class PreparedRow:
     model_input: Any
 
 
-@dataclass(frozen=True, slots=True)
-class DecodedChunk:
-    """A chunk (H, D) in [-1, 1], and, if the model has one, the distribution of which it is the mode."""
-
-    values: np.ndarray
-    mean: np.ndarray | None = None
-    spread: np.ndarray | None = None
-    behaviour: dict[str, Any] = field(default_factory=dict)  # requested outputs of the row
-
-    def prediction(self, scale: Scale) -> Prediction:
-        return Prediction(
-            scale.restore(self.values),
-            None if self.mean is None else scale.restore(self.mean),
-            None if self.spread is None else scale.restore_spread(self.spread),
-            self.behaviour,
-        )
-
-
 class PrismaticPolicy(ModelPolicy):
     """Computes all valid rows of a batch together, each in the units of its own dataset."""
 
@@ -452,7 +434,7 @@ class PrismaticPolicy(ModelPolicy):
         """Return the model's input for a row of the dataset `key`; an error fails only that row."""
 
     @abc.abstractmethod
-    def _compute(self, prepared: Sequence[PreparedRow]) -> list[DecodedChunk]:
+    def _compute(self, prepared: Sequence[PreparedRow]) -> list[Prediction]:
         """Compute all rows in one batch."""
 
     def reset(self, obs: Obs, instruction: str | None, **kwargs: Any) -> dict[str, Any]:
@@ -466,10 +448,7 @@ class PrismaticPolicy(ModelPolicy):
             key = self._key(row)
             return PreparedRow(row, self._statistics(row.adapter).scale(key), self._model_input(row, key))
 
-        def compute(good: list[PreparedRow]) -> list[Prediction]:
-            return [chunk.prediction(one.scale) for one, chunk in zip(good, self._compute(good), strict=True)]
-
-        return of_good([attempt(prepare, row) for row in rows], compute)
+        return of_good([attempt(prepare, row) for row in rows], self._compute)
 
     def _example(self, seed: int, instruction: str = "warm up") -> Row:
         """Return a row of any dataset; sessions may select theirs later."""
@@ -490,17 +469,19 @@ class PrismaticPolicy(ModelPolicy):
             )
         self._checkpoint.own[adapter] = own  # type: ignore[union-attr]
 
-    def _decoded(self, bins: ActionBins, prepared: Sequence[PreparedRow], tokens: Any, over: Any) -> list[DecodedChunk]:
+    def _decoded(self, bins: ActionBins, prepared: Sequence[PreparedRow], tokens: Any, over: Any) -> list[Prediction]:
         """Return the chunks of action tokens (B, H, D) that were chosen by the logits of bins (B, H, D, bins)."""
         chunks, parts = [], bins.stated(tokens, over)
         for i, entry in enumerate(prepared):
-            values, mean, spread, logprob, entropy, chosen = parts[:, i, :, : entry.scale.dim]
+            scale = entry.scale
+            values, mean, spread, logprob, entropy, chosen = parts[:, i, :, : scale.dim]
             said = {
                 "logprob": self._used(logprob),
                 "entropy": float(self._used(entropy).sum()),
                 "replay": {"tokens": chosen.astype(np.int64)},
             }
-            chunks.append(DecodedChunk(values, mean, spread, {name: said[name] for name in entry.row.want}))
+            found = scale.restore(values), scale.restore(mean), scale.restore_spread(spread)
+            chunks.append(Prediction(*found, {name: said[name] for name in entry.row.want}))
         return chunks
 
     def _statistics(self, adapter: str = "") -> Statistics:
