@@ -31,6 +31,7 @@ from vlagents_ray.policies.base.model_inputs import (
     state_vector,
 )
 from vlagents_ray.policies.compilation import Compilation
+from vlagents_ray.policies.outcomes import of_good
 from vlagents_ray.registry import require
 
 
@@ -93,30 +94,6 @@ def to_pixels(image: np.ndarray, side: int) -> np.ndarray:
     resized = torch.nn.functional.interpolate(square, size=(side, side), mode="bilinear", align_corners=False)[0]
     mean, std = (torch.tensor(values)[:, None, None] * 255 for values in (_MEAN, _STD))
     return np.asarray(((resized - mean) / std).numpy())
-
-
-class Encoder:
-    """Computes features of still images; each is repeated as the two frames of one step of the encoder."""
-
-    def __init__(self, model: Any, normalize: bool, compilation: Compilation) -> None:
-        self._model = model
-        self._normalized = normalizer(normalize)
-        self._encode = compilation.core("encode", self._features)
-
-    def __call__(self, pixels: Sequence[np.ndarray]) -> Any:
-        """Compute features (B, N, F) of images, each (3, side, side) float32."""
-        images = require("torch").as_tensor(np.stack(pixels))
-        return self._encode(images.to(self._model.device, self._model.dtype, non_blocking=True))
-
-    def _features(self, images: Any) -> Any:
-        clip = images[:, None].repeat(1, 2, 1, 1, 1)
-        return self._normalized(self._model(pixel_values_videos=clip, skip_predictor=True).last_hidden_state.float())
-
-
-def normalizer(normalize: bool) -> Callable[[Any], Any]:
-    """Return a function that normalises features (..., F), or returns them unchanged if not `normalize`."""
-    layer_norm = require("torch").nn.functional.layer_norm
-    return lambda features: layer_norm(features, features.shape[-1:]) if normalize else features
 
 
 def load_encoder(config: VJepa2AcConfig, saved: Mapping[str, Any] | None) -> Any:
@@ -374,19 +351,29 @@ class WorldModel:
     def __init__(
         self, encoder: Any, predictor: Any, config: VJepa2AcConfig, dtype: Any, compilation: Compilation
     ) -> None:
-        self.encode = Encoder(encoder, config.normalize, compilation)
-        self._predictor = predictor
+        self._encoder, self._predictor = encoder, predictor
+        self._encode = compilation.core("encode", self._features)
         self._following = [  # by the number of known frames
             compilation.core(f"predict frame {frames + 1}", self._predict, config.plans_a_pass)
             for frames in range(1, config.rollout + 1)
         ]
-        self._normalized = normalizer(config.normalize)
+        layer_norm = require("torch").nn.functional.layer_norm
+        self._normalized = lambda found: layer_norm(found, found.shape[-1:]) if config.normalize else found
         self._device, self._dtype = encoder.device.type, dtype
 
     def autocast(self) -> Any:
         """Return a context that computes in `dtype`, as in upstream's training; attention needs weights of one type."""
         torch = require("torch")
         return torch.autocast(self._device, self._dtype, enabled=self._dtype != torch.float32)
+
+    def encode(self, pixels: Sequence[np.ndarray]) -> Tensor:
+        """Compute features (B, N, F) of still images, each (3, side, side) float32."""
+        images = require("torch").as_tensor(np.stack(pixels))
+        return self._encode(images.to(self._encoder.device, self._encoder.dtype, non_blocking=True))
+
+    def _features(self, images: Tensor) -> Tensor:
+        clip = images[:, None].repeat(1, 2, 1, 1, 1)  # the two frames of one step of the encoder
+        return self._normalized(self._encoder(pixel_values_videos=clip, skip_predictor=True).last_hidden_state.float())
 
     def __call__(self, features: Tensor, actions: Tensor, poses: Tensor) -> Tensor:
         """Predict the next frame's features (see `World`)."""
@@ -457,12 +444,10 @@ class VJepa2Ac(ModelPolicy):
         return Frame(to_pixels(image, self.config.image_size), pose)
 
     def predict(self, rows: Sequence[Row]) -> list[Prediction | Exception]:
-        ready = [row for row in rows if _GOAL in row.memory]
-        found = iter(self._plans(ready) if ready else [])
         no_goal = InvalidObservation(
             f"info[{GOAL_IMAGE!r}]: got none since the reset, want an image of the goal, (H, W, 3) uint8"
         )
-        return [next(found) if _GOAL in row.memory else no_goal for row in rows]
+        return of_good([row if _GOAL in row.memory else no_goal for row in rows], self._plans)
 
     def _plans(self, rows: Sequence[Row]) -> list[Prediction]:
         torch = require("torch")
