@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import inspect
 from collections.abc import Mapping, Sequence
+from contextlib import AbstractContextManager
 from typing import Any
 
 import numpy as np
@@ -93,6 +94,13 @@ class Kind:
         return self.policy.predict_action_chunk(batch)
 
 
+def row_draws(rows: Sequence[Row], *models: Any) -> AbstractContextManager[object]:
+    """Return the context in which models draw each row's numbers from that row's generator."""
+    from vlagents_ray.policies.sampling_rng import RowDraws  # imports torch
+
+    return RowDraws([row.rng for row in rows], *models)
+
+
 def vectors(config: Any) -> list[str]:
     """Return the observation keys of the vectors that a policy reads."""
     features = {FRAMES[0]: config.robot_state_feature, FRAMES[1]: config.env_state_feature}
@@ -154,14 +162,12 @@ class MultiTaskDit(Kind):
         return int(self.config.horizon - self.steps + 1)
 
     def draw(self, batch: dict[str, Any], rows: Sequence[Row], leftovers: Sequence[Any]) -> Any:
-        from vlagents_ray.policies.sampling_rng import RowDraws
-
         seen = stacked(batch, self.config, len(rows))
         for name in _TOKENS:
             seen[name] = batch[name].unflatten(0, (len(rows), -1))[:, -1]  # the same in each step of a history
         condition = self.policy.observation_encoder.encode(seen)
         own = self.policy.objective, require("diffusers.utils.torch_utils")  # DDPM's steps draw in the latter
-        with RowDraws([row.rng for row in rows], *own):
+        with row_draws(rows, *own):
             actions = self.policy.objective.conditional_sample(self.policy.noise_predictor, len(rows), condition)
         return actions[:, self.steps - 1 :]
 
@@ -355,14 +361,12 @@ class Groot(Kind):
         return min(int(self.policy._action_queue_steps), self.horizon)
 
     def draw(self, batch: dict[str, Any], rows: Sequence[Row], leftovers: Sequence[Any]) -> Any:
-        from vlagents_ray.policies.sampling_rng import RowDraws
-
         groups: dict[int, list[int]] = {}
         for place, length in enumerate(batch["attention_mask"].sum(1).tolist()):
             groups.setdefault(int(length), []).append(place)
         chunks: list[Any] = [None] * len(rows)
         for length, places in groups.items():
-            with RowDraws([rows[place].rng for place in places], self.policy._groot_model.action_head):
+            with row_draws([rows[place] for place in places], self.policy._groot_model.action_head):
                 drawn = self.policy.predict_action_chunk(_part(batch, places, length, len(rows)))
             for place, chunk in zip(places, drawn, strict=True):
                 chunks[place] = chunk
@@ -475,8 +479,6 @@ class XVla(Kind):
         self._look = policy.model.forward_vlm
 
     def draw(self, batch: dict[str, Any], rows: Sequence[Row], leftovers: Sequence[Any]) -> Any:
-        from vlagents_ray.policies.sampling_rng import RowDraws
-
         firsts, owners = shared_frames(rows)
 
         def look(*inputs: Any) -> dict[str, Any]:
@@ -484,7 +486,7 @@ class XVla(Kind):
             return {name: one[owners] for name, one in self._look(*(each[firsts] for each in inputs)).items()}
 
         self.policy.model.forward_vlm = look
-        with RowDraws([row.rng for row in rows], self.policy.model):
+        with row_draws(rows, self.policy.model):
             return self.policy.predict_action_chunk(batch)
 
 
@@ -503,9 +505,7 @@ class VqBet(Kind):
         return int(self.config.action_chunk_size)
 
     def draw(self, batch: dict[str, Any], rows: Sequence[Row], leftovers: Sequence[Any]) -> Any:
-        from vlagents_ray.policies.sampling_rng import RowDraws
-
-        with RowDraws([row.rng for row in rows], self.policy.vqbet):
+        with row_draws(rows, self.policy.vqbet):
             return self.policy.vqbet(stacked(batch, self.config, len(rows)), rollout=True)
 
 
