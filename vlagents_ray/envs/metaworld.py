@@ -82,8 +82,7 @@ class MetaWorld(SimulatorEnv):
         """
         if max_steps > PROTOCOL.max_steps:
             raise ConfigError(f"metaworld: max_steps is {max_steps}, want at most {PROTOCOL.max_steps}: there it stops")
-        super().__init__(f"metaworld/{task}", width=width, height=height, max_steps=max_steps)
-        self.require_task(task)
+        super().__init__(task, width=width, height=height, max_steps=max_steps)
         self.max_steps, self._ends_on_success = max_steps, ends_on_success
         self._instruction = instruction or task.removesuffix("-v3").replace("-", " ")
         self._goals: list[Any] | None = None
@@ -128,11 +127,6 @@ class MetaWorld(SimulatorEnv):
             return []
         prepare_rendering()
         return sorted(require("metaworld").ALL_V3_ENVIRONMENTS)
-
-    @classmethod
-    def require_task(cls, task: str | None) -> None:
-        if cls.tasks():  # empty if Meta-World is not installed
-            super().require_task(task)
 
     def describe(self) -> dict[str, Any]:
         return super().describe() | {

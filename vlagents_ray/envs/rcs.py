@@ -213,7 +213,7 @@ class Rcs(SimulatorEnv):
         limit = protocol.max_steps if max_steps is None and protocol is not None else max_steps
         if limit is None:
             raise ConfigError(f"{self.suite}/{task} has no step limit of its own; set max_steps")
-        super().__init__(f"{self.suite}/{task}", width=width, height=height, max_steps=limit)
+        super().__init__(task, width=width, height=height, max_steps=limit)
         self.max_steps = limit
         self._mode = control_mode or self._task.control_mode
         self._given_instruction = instruction

@@ -176,8 +176,7 @@ class RoboCasa(RobosuiteEnv):
                 gripper, base, torso, mode, the order of RoboCasa's `convert_action` and of LeRobot's environment.
             object_registries: The sets of objects to draw from; the protocol uses both.
         """
-        self.require_task(task)
-        super().__init__(f"robocasa/{task}", width=width, height=height, max_steps=max_steps)
+        super().__init__(task, width=width, height=height, max_steps=max_steps)
         for option, chosen, known in (
             ("split", [split], SPLITS),
             ("action_order", [action_order], ACTION_ORDERS),

@@ -257,8 +257,7 @@ class Robosuite(RobosuiteEnv):
             task: robosuite's name, one of `tasks()`.
             cameras: MuJoCo's names; None selects robomimic's cameras for the task.
         """
-        self.require_task(task)
-        super().__init__(f"robosuite/{task}", width=width, height=height, max_steps=max_steps)
+        super().__init__(task, width=width, height=height, max_steps=max_steps)
         self._task = TASKS[task]
         self._protocol, self._ends_on_success = self._task.protocol, ends_on_success
         self.max_steps = max_steps or self._task.protocol.max_steps

@@ -97,8 +97,7 @@ class Simpler(SimulatorEnv):
             render_backend: "cpu", "gpu", or "auto": the GPU if both SAPIEN and torch can use it.
             shader: ManiSkill's name of the shader; the protocol uses "default".
         """
-        self.require_task(task)
-        super().__init__(f"simpler/{task}")
+        super().__init__(task)
         _find_assets(assets)
         own_limit = registered_limit(task)
         self.max_steps = step_limit(self._name, max_steps, own_limit)

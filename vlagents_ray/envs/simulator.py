@@ -72,10 +72,11 @@ class SimulatorEnv(EvalEnv):
     _env: Any = None  # the simulator; None before it is made and after `close`
     _steps: int | None = None  # steps of the current episode; None before the first reset
 
-    def __init__(self, name: str, **sizes: int | None) -> None:
-        """Check that each of `sizes` is at least 1 or None, and set the variables that drivers read when they load."""
-        self._name = name
-        require_sizes(name, **sizes)
+    def __init__(self, task: str, **sizes: int | None) -> None:
+        """Check the task, and that each of `sizes` is at least 1 or None; set the variables that drivers read."""
+        self.require_task(task)
+        self._name = f"{self.suite}/{task}"
+        require_sizes(self._name, **sizes)
         self._resources = ExitStack()  # called by `close`, last in first out
         prepare_rendering()
 
@@ -89,8 +90,8 @@ class SimulatorEnv(EvalEnv):
 
     @classmethod
     def require_task(cls, task: str | None) -> None:
-        if task is not None:  # the constructor has a default
-            require_known(cls.suite, task, cls.tasks())
+        if task is not None and (known := cls.tasks()):  # the constructor has a default
+            require_known(cls.suite, task, known)
 
     @classmethod
     def missing(cls) -> str | None:

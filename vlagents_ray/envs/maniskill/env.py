@@ -82,7 +82,7 @@ class ManiSkill(SimulatorEnv):
             reconfigure: Rebuild the scene for each episode. Without it the dynamics of some tasks
                 (PlugCharger, PushT) depend on the previous episode; it saves about 15 ms per reset.
         """
-        super().__init__(f"maniskill/{task}")
+        super().__init__(task)
         self._own_limit = registered_limit(task)
         self.max_steps = step_limit(self._name, max_steps, self._own_limit)
         self._given_instruction = instruction
