@@ -246,11 +246,9 @@ class Calvin(SimulatorEnv):
             find_checkout(None)
         except ConfigError as error:
             return str(error)
-        return (
-            None
-            if graphics.devices()
-            else f"CALVIN finds no EGL device; {EGL_CURE}, or set the option renderer to tiny"
-        )
+        if graphics.devices():
+            return None
+        return f"CALVIN finds no EGL device; {EGL_CURE}, or set the option renderer to tiny"
 
     def renderer(self) -> Renderer | None:
         return super().renderer() if self._renderer == "egl" else None

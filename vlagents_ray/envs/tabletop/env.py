@@ -173,13 +173,8 @@ class Tabletop(EvalEnv):
         world.step(dx * STEP_LIMIT, dy * STEP_LIMIT, dz * STEP_LIMIT, (grip + 1) / 2)
         self._steps += 1
         success = goal.reached(world)
-        return (
-            self._observe(world, goal, look=self.looked_at),
-            float(success),
-            False,
-            self._steps >= self.max_steps,
-            {"success": success},
-        )
+        obs = self._observe(world, goal, look=self.looked_at)
+        return obs, float(success), False, self._steps >= self.max_steps, {"success": success}
 
     def close(self) -> None:
         self._world = self._goal = None
