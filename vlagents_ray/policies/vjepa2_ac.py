@@ -22,14 +22,7 @@ from vlagents_ray.policies.base.accelerator import ensure_torchvision, fetch, to
 from vlagents_ray.policies.base.checkpoint import find_checkpoint, from_pretrained, require_loaded
 from vlagents_ray.policies.base.config import ModelConfig
 from vlagents_ray.policies.base.model_code import use_source
-from vlagents_ray.policies.base.model_inputs import (
-    GRIPPER,
-    camera_images,
-    camera_specs,
-    choose_cameras,
-    state_specs,
-    state_vector,
-)
+from vlagents_ray.policies.base.model_inputs import GRIPPER, camera_images, choose_cameras, state_specs, state_vector
 from vlagents_ray.policies.compilation import Compilation
 from vlagents_ray.policies.outcomes import of_good
 from vlagents_ray.registry import require
@@ -400,10 +393,12 @@ class VJepa2Ac(ModelPolicy):
 
     @property
     def contract(self) -> Contract:
-        return Contract(
-            cameras=camera_specs(self._cameras),
+        return self.stated(
+            self._cameras,
+            [*self._state, GRIPPER],
+            self.config.rollout,
             state=state_specs(self._state, 6),
-            gripper=True,
+            instruction=None,
             action=ActionSpec(
                 dim=7,
                 space="ee_pose",
@@ -413,7 +408,7 @@ class VJepa2Ac(ModelPolicy):
                 gripper_open=1.0,
                 gripper_closed=0.0,
             ),
-            chunk=self.chunk(self.config.rollout),
+            history=None,
         )
 
     def load(self) -> WorldModel:
