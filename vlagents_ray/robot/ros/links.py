@@ -210,10 +210,13 @@ class Rosbridge:
                 self._reconnect()
                 continue
             try:
-                self._receive(socket.recv(_SILENT_S))
+                try:
+                    self._receive(socket.recv(_SILENT_S))
+                except TimeoutError:
+                    if not socket.ping().wait(_SILENT_S):  # its other end is gone, as after a power failure
+                        self._lose(socket)
+                        continue
                 self._ask_silent_again(socket)
-            except TimeoutError:
-                self._probe(socket)
             except (ConnectionClosed, OSError):
                 self._lose(socket)
 
@@ -228,16 +231,6 @@ class Rosbridge:
             if time.monotonic() - at > _SILENT_S:
                 socket.send(json.dumps({"op": "unsubscribe", "topic": topic}))
                 self._ask_for(topic, socket)
-
-    def _probe(self, socket: ClientConnection) -> None:
-        """Drop a connection whose other end ended without closing it, as after a power failure."""
-        try:
-            if socket.ping().wait(_SILENT_S):
-                self._ask_silent_again(socket)
-            else:
-                self._lose(socket)
-        except (ConnectionClosed, OSError):
-            self._lose(socket)
 
     def _reconnect(self) -> None:
         try:
