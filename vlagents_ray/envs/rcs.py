@@ -98,18 +98,11 @@ DUOBENCH_TASKS = {
 _REQUIRED = Path("assets/scenes/empty_world/scene.xml")
 
 
-@dataclass(frozen=True, slots=True)
-class _Assets:
-    """The location of a package's assets, and their download."""
-
-    variable: str  # the environment variable that names the folder
-    folder: str  # in the home folder, if the variable is not set
-    cure: str = ""  # further steps beside `import`
-
-
+# By package: the environment variable that names the folder of its assets, the folder in the home folder that counts if
+# it is not set, and further steps of the download beside `import`.
 _ASSETS = {
-    "rcs": _Assets("RCS_PREFIX", ".rcs"),
-    "duobench": _Assets(
+    "rcs": ("RCS_PREFIX", ".rcs", ""),
+    "duobench": (
         "DUOBENCH_PREFIX",
         ".duobench",
         f", then make {_REQUIRED} there, empty: DuoBench 0.1.2 has none, and each import would fetch all again",
@@ -125,12 +118,12 @@ def missing_packages(*packages: str) -> str | None:
                 f"{package} is not installed; make an environment, `vlagents-ray env make requirements/rcs.txt`, and "
                 f"have the workers run in it: runtime_env: {{py_executable: /path/to/.venv-rcs/bin/python}}"
             )
-        assets = _ASSETS[package]
-        prefix = Path(os.environ.get(assets.variable) or Path.home() / assets.folder).expanduser()
+        variable, folder, further = _ASSETS[package]
+        prefix = Path(os.environ.get(variable) or Path.home() / folder).expanduser()
         if not (prefix / _REQUIRED).is_file():
             return (
-                f"{package}'s assets are not in {prefix}: there is no {_REQUIRED}; set {assets.variable} to the folder "
-                f"that holds its `assets`, or fetch them once by `python -c 'import {package}'`{assets.cure}"
+                f"{package}'s assets are not in {prefix}: there is no {_REQUIRED}; set {variable} to the folder "
+                f"that holds its `assets`, or fetch them once by `python -c 'import {package}'`{further}"
             )
     return None
 

@@ -222,16 +222,8 @@ class TransferState(enum.IntEnum):
     END = 3
 
 
-@dataclass(frozen=True, slots=True)
-class ObservationPart:
-    """A part of a pickled observation."""
-
-    state: TransferState
-    data: memoryview
-
-
-def read_observation_part(message: bytes) -> ObservationPart:
-    """Return the content of an `Observation`; raise `MalformedMessage` for anything else."""
+def read_observation_part(message: bytes) -> tuple[TransferState, memoryview]:
+    """Return the content of an `Observation`, a part of a pickle; raise `MalformedMessage` for anything else."""
     number, data = 0, memoryview(b"")
     for field, value in _protobuf_fields(message):
         if field == 1 and isinstance(value, int):
@@ -239,7 +231,7 @@ def read_observation_part(message: bytes) -> ObservationPart:
         elif field == 2 and isinstance(value, memoryview):
             data = value
     try:
-        return ObservationPart(TransferState(number), data)
+        return TransferState(number), data
     except ValueError as error:
         raise MalformedMessage(f"observation: got transfer state {number}, want 1, 2 or 3") from error
 
