@@ -351,7 +351,7 @@ class WorldModel:
             for frames in range(1, config.rollout + 1)
         ]
         layer_norm = require("torch").nn.functional.layer_norm
-        self._normalized = lambda found: layer_norm(found, found.shape[-1:]) if config.normalize else found
+        self._normalized: Any = lambda found: layer_norm(found, found.shape[-1:]) if config.normalize else found
         self._device, self._dtype = encoder.device.type, dtype
 
     def autocast(self) -> Any:

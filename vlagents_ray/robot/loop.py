@@ -256,7 +256,7 @@ class _Run:
                     break
                 if self.watchdog is not None:
                     self.watchdog.heard("loop")
-                    ago_s = act.info.get(SILENT)
+                    ago_s: Any = act.info.get(SILENT)
                     known = isinstance(ago_s, int | float) and 0 <= ago_s < math.inf
                     self.watchdog.heard("server", float(ago_s) if known else 0.0)
                 if stop is not None:

@@ -191,7 +191,7 @@ class LeRobot(ModelPolicy):
         groups: dict[Any, list[int]] = {}
         for i, row in enumerate(rows):
             groups.setdefault(tuple(array.shape for array in row.frames[-1].values()), []).append(i)
-        drawn = {}
+        drawn: dict[int, Prediction | Exception] = {}
         for members in groups.values():
             drawn |= zip(members, self._draw([rows[i] for i in members]), strict=True)
         return [drawn[i] for i in range(len(rows))]
