@@ -70,7 +70,7 @@ class Shelf(SimulatorEnv):
     max_steps = 5
 
     def __init__(self, *, states: int | None = None, ends_on_success: bool = True, breaks: str = "") -> None:
-        super().__init__("shelf/top", width=8)
+        super().__init__("top", width=8)
         self.init_states, self._ends_on_success = states, ends_on_success
         self._contract, self._protocol = Contract(action=ActionSpec(dim=2)), PROTOCOL
         self.breaks, self.closed = breaks, 0

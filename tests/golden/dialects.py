@@ -61,11 +61,11 @@ def documents() -> Iterator[Trace]:
     """OpenVLA's, over HTTP."""
 
     def post(body: Any, session: str = "") -> tuple[bytes]:
-        data = body if isinstance(body, bytes) else openvla.encode_observation(body)
+        data = body if isinstance(body, bytes) else openvla.encode(body)
         return (http("POST", "/act", data, "application/json", session),)
 
     seen = {"image": PIXELS, "instruction": "pick"}
-    twice = {"encoded": openvla.encode_observation(seen).decode()}
+    twice = {"encoded": openvla.encode(seen).decode()}
     lone = asks(*map(post, [seen, twice, without(seen, "image"), without(seen, "instruction")]))
     kept = asks(post(seen, "s-1"), post(seen, "s-1"), post(seen | {"instruction": "place it"}, "s-1"))
     wrong = [seen | {"instruction": "fail"}, seen | {"image": PIXELS[0]}, b"{", b"[]", bytes(5000)]
@@ -133,8 +133,8 @@ def gateways() -> Iterator[Trace]:
         return ask("act", vlagents.write_observation({"arm": arm, "language_instruction": text}))
 
     old = '[{"cameras": {}, "camera_data_type": "raw", "gripper": 0.5, "info": {}}, "go", {"seed": 3}]'
-    ping = rpyc.request(8, rpyc.Handler.PING, rpyc.boxed_value(("hi",)))
-    look = rpyc.request(9, rpyc.Handler.INSPECT, rpyc.boxed_value(()))
+    ping = rpyc.request(8, rpyc.Handler.PING, (rpyc.VALUE, ("hi",)))
+    look = rpyc.request(9, rpyc.Handler.INSPECT, (rpyc.VALUE, ()))
     yield from scenario(
         "vlagents: calls",
         ("vlagents",),

@@ -171,36 +171,6 @@ class PlayerSettings:
             object.__setattr__(self, "deadline_s", 0.0)
 
 
-class Execution:
-    """Collects the actions of one episode that are executed in place of the policy's; each is sent in one request."""
-
-    def __init__(self) -> None:
-        """Begin an episode."""
-        self._in_place: deque[np.ndarray] = deque(maxlen=_IN_PLACE)
-        self._noted = False  # whether this tick has an action in place of the policy's
-
-    def tick(self) -> None:
-        """Begin a tick, without an action in place of the policy's yet."""
-        self._noted = False
-
-    def note_in_place(self, action: np.ndarray) -> None:
-        """Record an action, (D,), that is executed in place of the policy's, for the next request."""
-        self._in_place.append(action)
-        self._noted = True
-
-    def interrupt(self) -> None:
-        """Discard the recorded action of this tick, which was not executed: the robot was stopped or moved."""
-        if self._noted:
-            self._in_place.pop()
-            self._noted = False
-
-    def report(self) -> dict[str, Any]:
-        """Return the extra info of the next request: `EXECUTED`, if actions other than the policy's were executed."""
-        stated: dict[str, Any] = {EXECUTED: np.stack(self._in_place)} if self._in_place else {}
-        self._in_place.clear()
-        return stated
-
-
 class ChunkPlayer(Agent):
     """An `Agent` around another, local or remote, whose `act` returns single actions, (D,), one per control tick.
 
@@ -253,7 +223,9 @@ class ChunkPlayer(Agent):
     def _begin(self) -> None:
         self._plan.drop()
         self._tick: int | None = None  # tick of the next `act`; None outside an episode
-        self._request, self._execution = _Request(), Execution()  # the last request
+        self._request = _Request()  # the last one
+        # Actions, (D,), executed in place of the policy's since the last request, and whether this tick has one.
+        self._in_place, self._noted = deque[np.ndarray](maxlen=_IN_PLACE), False
         self._dropped = False  # whether its answer must not be executed
         self._chunks = 0  # number of answers
         self._waiting_since: float | None = None
@@ -300,7 +272,9 @@ class ChunkPlayer(Agent):
         tick at which it holds the robot; call it in your own loop when you stop or take over the robot.
         """
         self._begin_again(STOPPED)
-        self._execution.interrupt()
+        if self._noted:  # its action was not executed
+            self._in_place.pop()
+            self._noted = False
         self._motion.stop()
 
     def observe(self, obs: Obs, action: np.ndarray | None = None) -> None:
@@ -318,7 +292,7 @@ class ChunkPlayer(Agent):
             self._asker.settle()
         self._agent.observe(obs)
         if action is not None and self._tick is not None:
-            self._execution.note_in_place(self._motion.move(action, obs))
+            self._note_in_place(self._motion.move(action, obs))
             self._plan.advance()
             self._tick += 1
 
@@ -329,7 +303,7 @@ class ChunkPlayer(Agent):
             raise NotReset("act before reset; reset first")
         begun = time.monotonic()
         self._motion.tick()
-        self._execution.tick()
+        self._noted = False
         if self.control.update():
             self._begin_again(RELEASED)
         led = self.control.state == "human"
@@ -342,7 +316,7 @@ class ChunkPlayer(Agent):
         self._tick = tick + 1
         act = self._led(obs) if led else self._chosen(obs, tick)
         if led and SAFE not in act.info:  # the operator's action is executed in place of a row
-            self._execution.note_in_place(act.action)
+            self._note_in_place(act.action)
             self._plan.advance()
         return act
 
@@ -372,6 +346,10 @@ class ChunkPlayer(Agent):
         wanted = self.settings.deadline_s is not None or self.control.leader is not None
         safe = SafeAction(self.settings.safe, spec, self.settings.grippers) if wanted else None
         self._motion = Motion(self.check, self._contract, safe)
+
+    def _note_in_place(self, action: np.ndarray) -> None:
+        self._in_place.append(action)
+        self._noted = True
 
     def _note_asked(self, tick: int, obs: Obs) -> None:
         self._request, self._dropped = _Request(tick, self._plan.executed, self._captured(obs)), False
@@ -439,7 +417,8 @@ class ChunkPlayer(Agent):
         self._trouble = WAITING if added else LATE
 
     def _extras(self) -> dict[str, Any]:
-        extras = self._execution.report()
+        extras: dict[str, Any] = {EXECUTED: np.stack(self._in_place)} if self._in_place else {}
+        self._in_place.clear()
         if self.settings.timeout_s is not None:
             extras[DEADLINE] = self.settings.timeout_s * 1e3
         # The operator's actions replace those of the plan.
@@ -482,7 +461,7 @@ class ChunkPlayer(Agent):
         else:
             action, why = self._motion.hold(obs, why)
             if held is not None:  # the policy's action will not be executed
-                self._execution.note_in_place(action)
+                self._note_in_place(action)
         return Act(action, info={SAFE: why.reason, CAUSE: why.cause, SILENT: self._silent_s()})
 
     def _begin_again(self, why: Held) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import math
 import os
 import time
@@ -94,18 +95,16 @@ class ClientSession:
         return Request("act", obs, session=self.id, rank=self._rank, step=self.episode.step, request_id=request_id)
 
     def begun(self, reply: Reply) -> None:
-        """Record the reply that began or resumed the episode."""
+        """Record the reply that began, resumed or continued the episode."""
         self.step = reply.step
         if self.episode is not None:
             self.episode.step = reply.step
 
     def acted(self, obs: Obs, reply: Reply) -> None:
         """Record that `obs` was answered."""
-        self.step = reply.step
-        if self.episode is not None:
-            self.episode.step = reply.step
-            if self.episode.recent.maxlen:
-                self.episode.recent.append(copied(obs))
+        self.begun(reply)
+        if self.episode is not None and self.episode.recent.maxlen:
+            self.episode.recent.append(copied(obs))
 
     def is_lost(self, reply: Reply) -> bool:
         """Return whether the session must be resumed; if not, its replica checks that no answer was lost."""
@@ -227,9 +226,6 @@ class RemoteAgent(Agent):
         connection = Connection(
             url, new_transport, choice, timeout_s, connect_timeout_s or timeout_s, leaves_silent=resume
         )
-        self._attach(connection, rank, resume, commands)
-
-    def _attach(self, connection: Connection, rank: RankName, resume: bool, commands: CommandInbox | None) -> None:
         self._connection = connection
         self._commands = commands
         self._rank: RankName = rank
@@ -239,12 +235,9 @@ class RemoteAgent(Agent):
 
     def sessions(self, n: int) -> list[Self]:
         """Open `n` more sessions on this agent's connection, for `reset_batch` and `act_batch`; close each of them."""
-        made = []
-        for _ in range(n):
-            agent = object.__new__(type(self))
-            agent.credentials = self.credentials
-            agent._attach(self._connection, self._rank, self._resume, None)
-            made.append(agent)
+        made = [copy.copy(self) for _ in range(n)]
+        for agent in made:
+            agent._commands, agent._session = None, ClientSession(self._connection, self._rank)
         return made
 
     @property
@@ -405,14 +398,9 @@ class RemoteAgent(Agent):
         return found
 
     def _call(self, sessions: Sequence[ClientSession], requests: Sequence[Request], timeout_s: float) -> list[Reply]:
-        if self._tracer is not None:
-            return self._traced(requests, lambda: self._send(sessions, requests, timeout_s))
-        return self._send(sessions, requests, timeout_s)
-
-    def _send(self, sessions: Sequence[ClientSession], requests: Sequence[Request], timeout_s: float) -> list[Reply]:
-        if self._resume:
-            return call_with_recovery(self._connection, sessions, requests, timeout_s)
-        return self._connection.call(requests, timeout_s)
+        call = partial(call_with_recovery, self._connection, sessions) if self._resume else self._connection.call
+        send = partial(call, requests, timeout_s)
+        return send() if self._tracer is None else self._traced(requests, send)
 
     def _traced(self, requests: Sequence[Request], send: Callable[[], list[Reply]]) -> list[Reply]:
         """Send one message within a span, a child of the caller's if there is one and the parent of the server's."""

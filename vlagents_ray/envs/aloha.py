@@ -76,8 +76,7 @@ class Aloha(SimulatorEnv):
             task: "transfer_cube" or "insertion".
             cameras: MuJoCo's names: "top", "angle", "front_close", "left_wrist", "right_wrist", ….
         """
-        self.require_task(task)
-        super().__init__(f"aloha/{task}", width=width, height=height, max_steps=max_steps)
+        super().__init__(task, width=width, height=height, max_steps=max_steps)
         self.max_steps, self._ends_on_success = max_steps, ends_on_success
         self._instruction = instruction or _TASKS[task]
         self._contract = self.known_contract({"cameras": cameras, "width": width, "height": height})

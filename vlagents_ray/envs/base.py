@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from vlagents_ray.contract import Contract
+from vlagents_ray.contract import ActionSpec, Contract
 from vlagents_ray.envs.graphics import Renderer, opengl_renderer
 from vlagents_ray.errors import ConfigError, EnvFailed, InvalidAction, UnknownEnv
 from vlagents_ray.interface import Act, Obs
@@ -269,6 +269,20 @@ def known_contract(name: str, options: Mapping[str, Any]) -> Contract | None:
     bound = inspect.signature(cls).bind(**arguments)
     bound.apply_defaults()
     return cls.known_contract(bound.arguments)
+
+
+DELTA_POSE = ActionSpec(
+    dim=7,
+    space="ee_pose",
+    delta=True,
+    rotation="axis_angle",
+    frame="base",
+    gripper_open=-1.0,
+    gripper_closed=1.0,
+    low=-1.0,
+    high=1.0,
+)
+"""A change of the end effector's pose, and the gripper, as in robosuite; others differ in a few fields."""
 
 
 def require_cameras(env: str, names: Collection[str], have: Collection[str]) -> None:

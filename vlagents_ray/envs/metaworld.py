@@ -12,8 +12,8 @@ from typing import Any
 
 import numpy as np
 
-from vlagents_ray.contract import ActionSpec, CameraSpec, Contract, StateSpec
-from vlagents_ray.envs.base import require_cameras
+from vlagents_ray.contract import CameraSpec, Contract, StateSpec
+from vlagents_ray.envs.base import DELTA_POSE, require_cameras
 from vlagents_ray.envs.graphics import prepare_rendering
 from vlagents_ray.envs.simulator import BenchmarkProtocol, MujocoCameras, SimulatorEnv, camera_names
 from vlagents_ray.errors import ConfigError
@@ -82,8 +82,7 @@ class MetaWorld(SimulatorEnv):
         """
         if max_steps > PROTOCOL.max_steps:
             raise ConfigError(f"metaworld: max_steps is {max_steps}, want at most {PROTOCOL.max_steps}: there it stops")
-        super().__init__(f"metaworld/{task}", width=width, height=height, max_steps=max_steps)
-        self.require_task(task)
+        super().__init__(task, width=width, height=height, max_steps=max_steps)
         self.max_steps, self._ends_on_success = max_steps, ends_on_success
         self._instruction = instruction or task.removesuffix("-v3").replace("-", " ")
         self._goals: list[Any] | None = None
@@ -119,17 +118,7 @@ class MetaWorld(SimulatorEnv):
             state={"xyz": StateSpec(3, "m")},
             gripper=True,
             instruction=True,
-            action=ActionSpec(
-                dim=4,
-                space="ee_position",
-                delta=True,
-                rotation="none",
-                frame="world",
-                gripper_open=-1.0,
-                gripper_closed=1.0,
-                low=-1.0,
-                high=1.0,
-            ),
+            action=replace(DELTA_POSE, dim=4, space="ee_position", rotation="none", frame="world"),
         )
 
     @classmethod
@@ -138,11 +127,6 @@ class MetaWorld(SimulatorEnv):
             return []
         prepare_rendering()
         return sorted(require("metaworld").ALL_V3_ENVIRONMENTS)
-
-    @classmethod
-    def require_task(cls, task: str | None) -> None:
-        if cls.tasks():  # empty if Meta-World is not installed
-            super().require_task(task)
 
     def describe(self) -> dict[str, Any]:
         return super().describe() | {

@@ -98,18 +98,11 @@ DUOBENCH_TASKS = {
 _REQUIRED = Path("assets/scenes/empty_world/scene.xml")
 
 
-@dataclass(frozen=True, slots=True)
-class _Assets:
-    """The location of a package's assets, and their download."""
-
-    variable: str  # the environment variable that names the folder
-    folder: str  # in the home folder, if the variable is not set
-    cure: str = ""  # further steps beside `import`
-
-
+# By package: the environment variable that names the folder of its assets, the folder in the home folder that counts if
+# it is not set, and further steps of the download beside `import`.
 _ASSETS = {
-    "rcs": _Assets("RCS_PREFIX", ".rcs"),
-    "duobench": _Assets(
+    "rcs": ("RCS_PREFIX", ".rcs", ""),
+    "duobench": (
         "DUOBENCH_PREFIX",
         ".duobench",
         f", then make {_REQUIRED} there, empty: DuoBench 0.1.2 has none, and each import would fetch all again",
@@ -125,12 +118,12 @@ def missing_packages(*packages: str) -> str | None:
                 f"{package} is not installed; make an environment, `vlagents-ray env make requirements/rcs.txt`, and "
                 f"have the workers run in it: runtime_env: {{py_executable: /path/to/.venv-rcs/bin/python}}"
             )
-        assets = _ASSETS[package]
-        prefix = Path(os.environ.get(assets.variable) or Path.home() / assets.folder).expanduser()
+        variable, folder, further = _ASSETS[package]
+        prefix = Path(os.environ.get(variable) or Path.home() / folder).expanduser()
         if not (prefix / _REQUIRED).is_file():
             return (
-                f"{package}'s assets are not in {prefix}: there is no {_REQUIRED}; set {assets.variable} to the folder "
-                f"that holds its `assets`, or fetch them once by `python -c 'import {package}'`{assets.cure}"
+                f"{package}'s assets are not in {prefix}: there is no {_REQUIRED}; set {variable} to the folder "
+                f"that holds its `assets`, or fetch them once by `python -c 'import {package}'`{further}"
             )
     return None
 
@@ -153,58 +146,9 @@ def creator(task: RcsTask, name: str) -> Any:
     return made
 
 
-def configure(
-    config: Any,
-    *,
-    env: str,
-    control_mode: ControlMode,
-    delta: bool,
-    control_hz: float,
-    binary_gripper: bool,
-    size: Size,
-    cameras: Sequence[str] | None,
-) -> None:
-    """Configure a scene for an evaluation: without a window, and as fast as it can.
-
-    Args:
-        config: RCS's configuration of the scene, which is changed.
-        env: The env's name, for errors.
-        control_mode: The quantity that an action commands.
-        delta: Whether commands are relative to the arm's current position.
-        control_hz: Steps per second of simulated time, whether or not the arms have reached their targets.
-        binary_gripper: Whether the gripper only opens or closes.
-        size: (height, width) of each image, pixels.
-        cameras: Cameras of the scene to render; None selects all.
-    """
-    base = require("rcs.envs.base")
-    config.headless = True
-    config.sim_cfg.realtime = False
-    config.sim_cfg.async_control = True
-    config.sim_cfg.frequency = control_hz
-    config.control_mode = {
-        "joints": base.ControlMode.JOINTS,
-        "xyzrpy": base.ControlMode.CARTESIAN_TRPY,
-        "tquat": base.ControlMode.CARTESIAN_TQuat,
-    }[control_mode]
-    config.relative_to = base.RelativeTo.LAST_STEP if delta else base.RelativeTo.NONE
-    config.max_relative_movement = None  # RCS's default: none for absolute; 0.5 m, 90 degrees, 5 degrees a joint
-    config.wrapper_cfg.binary_gripper = binary_gripper
-    have = config.camera_cfgs or {}
-    require_cameras(env, cameras or (), have)
-    chosen = {name: have[name] for name in (have if cameras is None else cameras)}
-    config.camera_cfgs = {name: _sized(camera, size) for name, camera in chosen.items()} or None
-    if config.camera_adds is not None:
-        config.camera_adds = {name: added for name, added in config.camera_adds.items() if name in chosen}
-
-
-def _sized(camera: Any, size: Size) -> Any:
-    camera = copy.copy(camera)
-    camera.resolution_height, camera.resolution_width = size
-    return camera
-
-
 # RCS's angles are roll, pitch, yaw about fixed axes, R = Rz Ry Rx; its quaternions end with w.
 _UNITS = {"joints": "rad", "tquat": "m+quat_xyzw", "xyzrpy": "m+rad"}
+_MODES = {"joints": "JOINTS", "tquat": "CARTESIAN_TQuat", "xyzrpy": "CARTESIAN_TRPY"}
 _COMMANDS: dict[ControlMode, tuple[str, Rotation]] = {
     "joints": ("joint", "none"),
     "tquat": ("ee_pose", "quat_xyzw"),
@@ -262,7 +206,7 @@ class Rcs(SimulatorEnv):
         limit = protocol.max_steps if max_steps is None and protocol is not None else max_steps
         if limit is None:
             raise ConfigError(f"{self.suite}/{task} has no step limit of its own; set max_steps")
-        super().__init__(f"{self.suite}/{task}", width=width, height=height, max_steps=limit)
+        super().__init__(task, width=width, height=height, max_steps=limit)
         self.max_steps = limit
         self._mode = control_mode or self._task.control_mode
         self._given_instruction = instruction
@@ -270,16 +214,10 @@ class Rcs(SimulatorEnv):
         maker = creator(self._task, self._name)
         config = maker.config()
         self._task.prepare(config)
-        configure(
-            config,
-            env=self._name,
-            control_mode=self._mode,
-            delta=delta,
-            control_hz=hz,
-            binary_gripper=binary_gripper,
-            size=(height, width),
-            cameras=cameras,
-        )
+        config.sim_cfg.frequency = hz
+        config.relative_to = getattr(require("rcs.envs.base").RelativeTo, "LAST_STEP" if delta else "NONE")
+        config.wrapper_cfg.binary_gripper = binary_gripper
+        self._configure(config, cameras, (height, width))
         with self._making():
             self._env = maker.create_env(config)
             self._resources.callback(self._env.close)
@@ -339,6 +277,22 @@ class Rcs(SimulatorEnv):
         task_info = {key: value for key, value in info.items() if key not in self._arms.names}  # drops entries of arms
         outcome = {**plain(task_info), "success": bool(info["success"])}
         return self._observe(raw), float(reward), bool(terminated), outcome
+
+    def _configure(self, config: Any, cameras: Sequence[str] | None, size: Size) -> None:
+        """Configure RCS's scene for an evaluation: without a window, as fast as it can, with images of a size, px."""
+        config.headless = True
+        config.sim_cfg.realtime = False
+        config.sim_cfg.async_control = True  # a step takes its time, whether or not the arms have reached their targets
+        config.control_mode = getattr(require("rcs.envs.base").ControlMode, _MODES[self._mode])
+        config.max_relative_movement = None  # RCS's default: none for absolute; 0.5 m, 90 degrees, 5 degrees a joint
+        have = config.camera_cfgs or {}
+        require_cameras(self._name, cameras or (), have)
+        chosen = {name: copy.copy(have[name]) for name in (have if cameras is None else cameras)}
+        for camera in chosen.values():
+            camera.resolution_height, camera.resolution_width = size
+        config.camera_cfgs = chosen or None
+        if config.camera_adds is not None:
+            config.camera_adds = {name: added for name, added in config.camera_adds.items() if name in chosen}
 
     def _find(self, task: str, module: str | None) -> RcsTask:
         if task in self.known:

@@ -12,12 +12,14 @@ import importlib.util
 import io
 import warnings
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, Literal, get_args
 
 import numpy as np
 
-from vlagents_ray.contract import ActionSpec, CameraSpec, Contract, StateSpec
+from vlagents_ray.contract import CameraSpec, Contract, StateSpec
+from vlagents_ray.envs.base import DELTA_POSE
 from vlagents_ray.envs.render_probe import failing
 from vlagents_ray.envs.robosuite import RobosuiteEnv, importing_robosuite, seeded
 from vlagents_ray.envs.simulator import BenchmarkProtocol
@@ -174,8 +176,7 @@ class RoboCasa(RobosuiteEnv):
                 gripper, base, torso, mode, the order of RoboCasa's `convert_action` and of LeRobot's environment.
             object_registries: The sets of objects to draw from; the protocol uses both.
         """
-        self.require_task(task)
-        super().__init__(f"robocasa/{task}", width=width, height=height, max_steps=max_steps)
+        super().__init__(task, width=width, height=height, max_steps=max_steps)
         for option, chosen, known in (
             ("split", [split], SPLITS),
             ("action_order", [action_order], ACTION_ORDERS),
@@ -234,16 +235,10 @@ class RoboCasa(RobosuiteEnv):
             },
             gripper=True,
             instruction=True,
-            action=ActionSpec(
+            action=replace(
+                DELTA_POSE if last else replace(DELTA_POSE, gripper_open=None, gripper_closed=None),
                 dim=12,
                 space="base_velocity+ee_pose" if last else "ee_pose+base_velocity",
-                delta=True,
-                rotation="axis_angle",
-                frame="base",
-                gripper_open=-1.0 if last else None,
-                gripper_closed=1.0 if last else None,
-                low=-1.0,
-                high=1.0,
             ),
             control_hz=CONTROL_HZ,
         )
@@ -267,12 +262,8 @@ class RoboCasa(RobosuiteEnv):
         return obs, {"layout": int(facts["layout_id"]), "style": int(facts["style_id"])}
 
     @classmethod
-    def _missing_assets(cls) -> str | None:
-        try:
-            require_assets()
-        except EnvFailed as error:
-            return str(error)
-        return None
+    def _require_assets(cls) -> None:
+        require_assets()
 
     def _command(self, action: np.ndarray) -> np.ndarray:
         command = action[self._order]

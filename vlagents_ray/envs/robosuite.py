@@ -18,7 +18,8 @@ from typing import Any
 
 import numpy as np
 
-from vlagents_ray.contract import ActionSpec, CameraSpec, Contract, StateSpec
+from vlagents_ray.contract import CameraSpec, Contract, StateSpec
+from vlagents_ray.envs.base import DELTA_POSE
 from vlagents_ray.envs.graphics import EGL_DEVICE, GPUS
 from vlagents_ray.envs.render_probe import EGL_CURE
 from vlagents_ray.envs.simulator import BenchmarkProtocol, SimulatorEnv, Size
@@ -256,8 +257,7 @@ class Robosuite(RobosuiteEnv):
             task: robosuite's name, one of `tasks()`.
             cameras: MuJoCo's names; None selects robomimic's cameras for the task.
         """
-        self.require_task(task)
-        super().__init__(f"robosuite/{task}", width=width, height=height, max_steps=max_steps)
+        super().__init__(task, width=width, height=height, max_steps=max_steps)
         self._task = TASKS[task]
         self._protocol, self._ends_on_success = self._task.protocol, ends_on_success
         self.max_steps = max_steps or self._task.protocol.max_steps
@@ -305,18 +305,7 @@ class Robosuite(RobosuiteEnv):
             state={f"{arm}_{part}": spec for arm in task.arms for part, spec in parts.items()},
             gripper=len(task.arms) == 1,
             instruction=True,
-            action=ActionSpec(
-                dim=7 * len(task.arms),
-                space="ee_pose",
-                delta=True,
-                rotation="axis_angle",
-                frame="base",
-                gripper_open=-1.0,
-                gripper_closed=1.0,
-                low=-1.0,
-                high=1.0,
-                arms=task.arms if len(task.arms) > 1 else None,
-            ),
+            action=replace(DELTA_POSE, dim=7 * len(task.arms), arms=task.arms if len(task.arms) > 1 else None),
             control_hz=CONTROL_HZ,
         )
 

@@ -19,7 +19,7 @@ import numpy as np
 from vlagents_ray.contract import ActionSpec
 from vlagents_ray.envs.graphics import Renderer
 from vlagents_ray.envs.maniskill import ManiSkill
-from vlagents_ray.envs.maniskill.simulator import Moment, Simulator, registered_limit, step_limit
+from vlagents_ray.envs.maniskill.simulator import Moment, Simulator, step_limits
 from vlagents_ray.envs.simulator import SimulatorEnv
 from vlagents_ray.errors import ConfigError, EnvFailed
 from vlagents_ray.interface import Obs
@@ -97,11 +97,9 @@ class Simpler(SimulatorEnv):
             render_backend: "cpu", "gpu", or "auto": the GPU if both SAPIEN and torch can use it.
             shader: ManiSkill's name of the shader; the protocol uses "default".
         """
-        self.require_task(task)
-        super().__init__(f"simpler/{task}")
+        super().__init__(task)
         _find_assets(assets)
-        own_limit = registered_limit(task)
-        self.max_steps = step_limit(self._name, max_steps, own_limit)
+        self.max_steps, own_limit = step_limits(self._name, task, max_steps)
         self._deviations = [] if self.max_steps == own_limit else [f"max_steps is {max_steps}, not {own_limit}"]
         if shader != PROTOCOL.shader:
             self._deviations.append(f"shader is {shader}, not {PROTOCOL.shader}")

@@ -72,10 +72,11 @@ class SimulatorEnv(EvalEnv):
     _env: Any = None  # the simulator; None before it is made and after `close`
     _steps: int | None = None  # steps of the current episode; None before the first reset
 
-    def __init__(self, name: str, **sizes: int | None) -> None:
-        """Check that each of `sizes` is at least 1 or None, and set the variables that drivers read when they load."""
-        self._name = name
-        require_sizes(name, **sizes)
+    def __init__(self, task: str, **sizes: int | None) -> None:
+        """Check the task, and that each of `sizes` is at least 1 or None; set the variables that drivers read."""
+        self.require_task(task)
+        self._name = f"{self.suite}/{task}"
+        require_sizes(self._name, **sizes)
         self._resources = ExitStack()  # called by `close`, last in first out
         prepare_rendering()
 
@@ -89,14 +90,18 @@ class SimulatorEnv(EvalEnv):
 
     @classmethod
     def require_task(cls, task: str | None) -> None:
-        if task is not None:  # the constructor has a default
-            require_known(cls.suite, task, cls.tasks())
+        if task is not None and (known := cls.tasks()):  # the constructor has a default
+            require_known(cls.suite, task, known)
 
     @classmethod
     def missing(cls) -> str | None:
         """Return why the simulator cannot run here; the first call in a process renders one frame in a child."""
-        if lacks := without(cls.packages, cls.cure) or cls._missing_assets():
+        if lacks := without(cls.packages, cls.cure):
             return lacks
+        try:
+            cls._require_assets()
+        except EnvFailed as error:
+            return str(error)
         probe = egl_probe()
         return None if probe.ok else f"{cls.title} cannot render without a display ({probe.error}); {probe.cure}"
 
@@ -151,9 +156,8 @@ class SimulatorEnv(EvalEnv):
         """Execute an action, (D,) float32; return `(obs, reward, terminated, info)` as for `EvalEnv.step`."""
 
     @classmethod
-    def _missing_assets(cls) -> str | None:
-        """Return which files of the simulator are missing, with the cure; None if none is."""
-        return None
+    def _require_assets(cls) -> None:
+        """Raise `EnvFailed`, with the cure, if files of the simulator are missing."""
 
     def _solved(self, success: bool) -> tuple[bool, dict[str, Any]]:
         """Return `terminated` and `info` for a step, given whether the task is solved after it."""

@@ -20,14 +20,7 @@ from vlagents_ray.policies.base.accelerator import ensure_torchvision, fetch, to
 from vlagents_ray.policies.base.checkpoint import find_checkpoint, require_loaded
 from vlagents_ray.policies.base.checkpoint_files import revision
 from vlagents_ray.policies.base.model_code import use_source
-from vlagents_ray.policies.base.model_inputs import (
-    camera_images,
-    camera_specs,
-    choose_cameras,
-    needs_gripper,
-    state_specs,
-    state_vector,
-)
+from vlagents_ray.policies.base.model_inputs import camera_images, choose_cameras, state_vector
 from vlagents_ray.policies.base.staging import StagedRow, Staging
 from vlagents_ray.policies.compilation import Compilation
 from vlagents_ray.registry import require
@@ -89,15 +82,10 @@ class DiffusionPolicy(ModelPolicy):
             return Contract(instruction=False)
         parts, sizes = self._parts(network), network.vectors.values()
         own = {part: StateSpec(size) for part, size in zip(parts, sizes, strict=False)}
-        return Contract(
-            cameras=camera_specs(self._cameras(network)),
-            state=own if self.config.state is None else state_specs(parts, self.state_dim),
-            gripper=needs_gripper(parts),
-            instruction=False,
-            action=_action(network.module.action_dim, absolute=network.absolute),
-            chunk=self.chunk(network.module.n_action_steps),
-            history=self.history,
-        )
+        state = {"state": own} if self.config.state is None else {}
+        action = _action(network.module.action_dim, absolute=network.absolute)
+        horizon = network.module.n_action_steps
+        return self.stated(self._cameras(network), parts, horizon, instruction=False, action=action, **state)
 
     @property
     def state_dim(self) -> int | None:

@@ -59,11 +59,6 @@ def normal_logprob(values: Any, mean: Any, std: float) -> Any:
     return -0.5 * ((values - mean) / std) ** 2 - math.log(std) - 0.5 * _LOG_2_PI
 
 
-def normal_entropy(std: float) -> float:
-    """Return the differential entropy of a normal distribution, nats."""
-    return math.log(std) + 0.5 * (1.0 + _LOG_2_PI)
-
-
 def step_std(step: int, steps: int, noise_level: float) -> float:
     """Return the standard deviation of each number after a step.
 
@@ -116,7 +111,7 @@ def logprob_of_chain(velocity: Callable[[Any, float], Any], chain: Any, noise_le
 
 def chain_entropy(steps: int, noise_level: float) -> float:
     """Return the entropy of one number of a chain, given the noise, nats: it depends on the noise level alone."""
-    return sum(normal_entropy(step_std(step, steps, noise_level)) for step in range(steps))
+    return sum(math.log(step_std(step, steps, noise_level)) + 0.5 * (1.0 + _LOG_2_PI) for step in range(steps))
 
 
 class RandomSteps:

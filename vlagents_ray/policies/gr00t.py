@@ -24,16 +24,9 @@ from vlagents_ray.policies.base import ModelConfig, ModelPolicy, Prediction, Row
 from vlagents_ray.policies.base.accelerator import ensure_torchvision, fetch, torch_device, torch_dtype
 from vlagents_ray.policies.base.checkpoint import SavedTensors, find_checkpoint, require_loaded
 from vlagents_ray.policies.base.model_code import remote_code, use_source
-from vlagents_ray.policies.base.model_inputs import (
-    GRIPPER,
-    camera_images,
-    camera_specs,
-    choose_cameras,
-    needs_gripper,
-    state_specs,
-    state_vector,
-)
+from vlagents_ray.policies.base.model_inputs import GRIPPER, camera_images, choose_cameras, state_vector
 from vlagents_ray.policies.compilation import Compilation
+from vlagents_ray.policies.outcomes import attempt, of_good
 from vlagents_ray.registry import require
 
 CONFIG, STATISTICS = "processor_config.json", "statistics.json"
@@ -210,7 +203,8 @@ class Gr00tNetwork:
         dtype = torch_dtype(config.dtype, device)
         other = {} if config.backbone is None else {"model_name": config.backbone}
         transformers = require("transformers")
-        flash = flash_attention_is_here(device, dtype)
+        computes = device.type == "cuda" and dtype.itemsize == 2  # flash-attention, if it is installed
+        flash = computes and bool(require("transformers.utils").is_flash_attn_2_available())
         with (
             remote_code(allowed=config.trust_remote_code, source=code),
             contextlib.nullcontext() if flash else built_without_flash_attention(),
@@ -352,12 +346,6 @@ _FLASH, _PACKED = "flash_attention_2", "packed_sdpa"
 _CHECK = "_check_and_enable_flash_attn_2"  # a method of transformers' models, up to 4.5
 
 
-def flash_attention_is_here(device: Any, dtype: Any) -> bool:
-    """Return whether flash-attention is installed and supports the device and dtype: CUDA, 16 bits."""
-    computes = device.type == "cuda" and dtype.itemsize == 2
-    return computes and bool(require("transformers.utils").is_flash_attn_2_available())
-
-
 @contextlib.contextmanager
 def built_without_flash_attention() -> Iterator[None]:
     """Allow models that require flash-attention, such as N1.6's backbone, to be built without it in this context."""
@@ -476,15 +464,8 @@ class Gr00t(ModelPolicy):
         robot = self.model.embodiment
         parts = self._parts(robot)
         own = {part: StateSpec(width) for part, width in parts.items() if part != GRIPPER}
-        return Contract(
-            cameras=camera_specs(self._cameras(robot)),
-            state=own if self.config.state is None else state_specs(list(parts), self.state_dim),
-            gripper=needs_gripper(list(parts)),
-            instruction=True,
-            action=robot.spec,
-            chunk=self.chunk(robot.horizon),
-            history=self.history,
-        )
+        state = {"state": own} if self.config.state is None else {}
+        return self.stated(self._cameras(robot), list(parts), robot.horizon, action=robot.spec, **state)
 
     def load(self) -> Gr00tNetwork:
         """Read the checkpoint; raises `ConfigError` for settings that do not fit it."""
@@ -509,34 +490,23 @@ class Gr00t(ModelPolicy):
 
     def predict(self, rows: Sequence[Row]) -> list[Prediction | Exception]:
         """Compute the chunks of all rows whose observations GR00T's processor accepts."""
-        read = [self._inputs(row) for row in rows]
-        places = [place for place, one in enumerate(read) if not isinstance(one, Exception)]
-        found: list[Prediction | Exception] = list(read)  # type: ignore[arg-type]  # what is no error is replaced
-        if places:
-            chunks = self.loaded().chunks(
-                [rows[place].rng for place in places],
-                [read[place] for place in places],
-            )
-            for place, chunk in zip(places, chunks, strict=True):
-                found[place] = Prediction(chunk)
-        return found
 
-    def _inputs(self, row: Row) -> dict[str, Any] | Exception:
-        """Return the model's inputs of a row, or an exception for its session."""
+        def compute(good: list[tuple[np.random.Generator, dict[str, Any]]]) -> list[Prediction]:
+            return [Prediction(chunk) for chunk in self.loaded().chunks(*zip(*good, strict=True))]
+
+        return of_good([attempt(self._inputs, row) for row in rows], compute)
+
+    def _inputs(self, row: Row) -> tuple[np.random.Generator, dict[str, Any]]:
+        """Return the random generator and the model's inputs of a row."""
         newest = row.frames[-1]
         if newest.inputs is not None:
-            return newest.inputs  # type: ignore[no-any-return]
+            return row.rng, newest.inputs
         network: Gr00tNetwork = self.loaded()
         frames = row.history(self.history)
         moments = network.embodiment.moments
-        try:
-            return network.inputs(
-                [frames[moment - 1].images for moment in moments["video"]],
-                [frames[moment - 1].state for moment in moments["state"]],
-                row.instruction,
-            )
-        except Exception as error:  # noqa: BLE001 - returned to the session of the observation
-            return error
+        images = [frames[moment - 1].images for moment in moments["video"]]
+        state = [frames[moment - 1].state for moment in moments["state"]]
+        return row.rng, network.inputs(images, state, row.instruction)
 
     def _parts(self, robot: Embodiment) -> dict[str, int | None]:
         """Return the parts of our state that form the model's, with their widths if known."""

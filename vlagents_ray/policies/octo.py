@@ -24,14 +24,7 @@ from vlagents_ray.policies.base import ModelConfig, ModelPolicy, Prediction, Row
 from vlagents_ray.policies.base.accelerator import jax_device
 from vlagents_ray.policies.base.checkpoint import find_checkpoint, require_filled
 from vlagents_ray.policies.base.model_code import CURE, remote_code, use_source
-from vlagents_ray.policies.base.model_inputs import (
-    camera_images,
-    camera_specs,
-    choose_cameras,
-    needs_gripper,
-    state_specs,
-    state_vector,
-)
+from vlagents_ray.policies.base.model_inputs import camera_images, choose_cameras, state_vector
 from vlagents_ray.registry import require
 
 
@@ -100,16 +93,9 @@ class Octo(ModelPolicy):
         network: OctoNetwork | None = self.model
         if network is None:
             return Contract(instruction=instruction, history=self.config.window)
-        dim = len(network.statistics(self.config.dataset, "action")["mean"])
-        return Contract(
-            cameras=camera_specs(self._cameras(network)),
-            state=state_specs(self.config.state or (), self.state_dim),
-            gripper=needs_gripper(self.config.state or ()),
-            instruction=instruction,
-            action=_action(dim, self.config.dataset),
-            chunk=self.chunk(network.head.action_horizon),
-            history=self.history,
-        )
+        action = _action(len(network.statistics(self.config.dataset, "action")["mean"]), self.config.dataset)
+        cameras, parts, horizon = self._cameras(network), self.config.state or (), network.head.action_horizon
+        return self.stated(cameras, parts, horizon, instruction=instruction, action=action)
 
     @property
     def state_dim(self) -> int | None:

@@ -22,17 +22,10 @@ from vlagents_ray.policies.base.accelerator import fetch, jax_device, torch_devi
 from vlagents_ray.policies.base.checkpoint import STEP, SavedTensors, find_checkpoint, require_loaded
 from vlagents_ray.policies.base.config import Guidance, NoiseLevel
 from vlagents_ray.policies.base.model_code import use_source
-from vlagents_ray.policies.base.model_inputs import (
-    CLOSED,
-    GRIPPER,
-    camera_images,
-    camera_specs,
-    choose_cameras,
-    needs_gripper,
-    state_vector,
-)
+from vlagents_ray.policies.base.model_inputs import CLOSED, GRIPPER, camera_images, choose_cameras, state_vector
 from vlagents_ray.policies.compilation import Compilation
 from vlagents_ray.policies.flow import OFFERED, Change, Guide, Pi0Passes, RandomSteps
+from vlagents_ray.policies.outcomes import attempt
 from vlagents_ray.registry import require
 
 Layout = Literal["hwc", "chw"]
@@ -502,14 +495,13 @@ class OpenPi(ModelPolicy):
             return Contract()
         robot = self.model.robot
         parts = {part: dim for vector in robot.state.values() for part, dim in vector.items()}
-        return Contract(
-            cameras=camera_specs(robot.cameras),
+        return self.stated(
+            robot.cameras,
+            list(parts),
+            self.model.horizon,
             state={part: StateSpec(dim) for part, dim in parts.items() if part not in (GRIPPER, CLOSED)},
-            gripper=needs_gripper(list(parts)),
             instruction=self.model.transforms.prompt,
             action=robot.action,
-            chunk=self.chunk(self.model.horizon),
-            history=1,
             behaviour=self.offered(OFFERED if self.config.noise_level else ()),
         )
 
@@ -546,10 +538,10 @@ class OpenPi(ModelPolicy):
 
     def predict(self, rows: Sequence[Row]) -> list[Prediction | Exception]:
         """Compute the chunks of all rows that openpi's transforms accept, in one call of the model."""
-        read = [self._planned(row) for row in rows]
+        read = [attempt(self._planned, row) for row in rows]
         spare = next((one for one in read if not isinstance(one, Exception)), None)
         if spare is None:
-            return read  # type: ignore[return-value]  # errors all
+            return read  # errors all
         # A valid row replaces an invalid one, so that the number of rows stays one that is compiled.
         spare = replace(spare, row=replace(spare.row, want=()))
         flows, stated = self._sample([spare if isinstance(one, Exception) else one for one in read])
@@ -561,14 +553,11 @@ class OpenPi(ModelPolicy):
             for i, (one, flow) in enumerate(zip(read, flows, strict=True))
         ]
 
-    def _planned(self, row: Row) -> TransformedRow | Exception:
-        """Return the row with its leftover actions in the model's units, or an exception for its session."""
+    def _planned(self, row: Row) -> TransformedRow:
+        """Return the row with its leftover actions in the model's units."""
         loaded, seen = self.loaded(), row.frames[-1]
-        try:
-            if row.leftover is not None:
-                row = replace(row, leftover=loaded.transforms.plan(seen.raw, row.instruction, row.leftover))
-        except Exception as error:  # noqa: BLE001 - returned to the session of the observation
-            return error
+        if row.leftover is not None:
+            row = replace(row, leftover=loaded.transforms.plan(seen.raw, row.instruction, row.leftover))
         return TransformedRow(seen.inputs, row, row.noise(*loaded.model.noise_shape or ()))
 
     def _sample(self, ready: Sequence[TransformedRow]) -> tuple[np.ndarray, dict[int, dict[str, Any]]]:

@@ -22,15 +22,7 @@ from vlagents_ray.policies.base import ModelConfig, ModelPolicy, Prediction, Row
 from vlagents_ray.policies.base.accelerator import ensure_torchvision, fetch, torch_device, torch_dtype
 from vlagents_ray.policies.base.checkpoint import find_checkpoint, from_pretrained
 from vlagents_ray.policies.base.config import Guidance, NoiseLevel
-from vlagents_ray.policies.base.model_inputs import (
-    camera_images,
-    camera_specs,
-    choose_cameras,
-    needs_gripper,
-    resize_with_pad,
-    state_specs,
-    state_vector,
-)
+from vlagents_ray.policies.base.model_inputs import camera_images, choose_cameras, resize_with_pad, state_vector
 from vlagents_ray.policies.base.staging import StagedRow, Staging
 from vlagents_ray.policies.flow import OFFERED, FlowPasses, cache_of, layers_of, start_flow
 from vlagents_ray.registry import require
@@ -102,16 +94,10 @@ class Pi0(ModelPolicy):
     @property
     def contract(self) -> Contract:
         loaded = self.model
-        return Contract(
-            cameras=camera_specs(self.cameras),
-            state=state_specs(self.state, self.state_dim),
-            gripper=needs_gripper(self.state),
-            instruction=True,
-            action=ActionSpec(dim=None if loaded is None else len(loaded.processor.actions_mean)),
-            chunk=None if loaded is None else self.chunk(loaded.network.config.chunk_size),
-            history=1,
-            behaviour=self.offered(OFFERED if self.config.noise_level else ()),
-        )
+        horizon = None if loaded is None else loaded.network.config.chunk_size
+        action = ActionSpec(dim=None if loaded is None else len(loaded.processor.actions_mean))
+        behaviour = self.offered(OFFERED if self.config.noise_level else ())
+        return self.stated(self.cameras, self.state, horizon, action=action, behaviour=behaviour)
 
     @property
     def state_dim(self) -> int | None:

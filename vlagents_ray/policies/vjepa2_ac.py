@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib
+import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass, replace
@@ -21,15 +22,9 @@ from vlagents_ray.policies.base.accelerator import ensure_torchvision, fetch, to
 from vlagents_ray.policies.base.checkpoint import find_checkpoint, from_pretrained, require_loaded
 from vlagents_ray.policies.base.config import ModelConfig
 from vlagents_ray.policies.base.model_code import use_source
-from vlagents_ray.policies.base.model_inputs import (
-    GRIPPER,
-    camera_images,
-    camera_specs,
-    choose_cameras,
-    state_specs,
-    state_vector,
-)
+from vlagents_ray.policies.base.model_inputs import GRIPPER, camera_images, choose_cameras, state_specs, state_vector
 from vlagents_ray.policies.compilation import Compilation
+from vlagents_ray.policies.outcomes import of_good
 from vlagents_ray.registry import require
 
 
@@ -92,30 +87,6 @@ def to_pixels(image: np.ndarray, side: int) -> np.ndarray:
     resized = torch.nn.functional.interpolate(square, size=(side, side), mode="bilinear", align_corners=False)[0]
     mean, std = (torch.tensor(values)[:, None, None] * 255 for values in (_MEAN, _STD))
     return np.asarray(((resized - mean) / std).numpy())
-
-
-class Encoder:
-    """Computes features of still images; each is repeated as the two frames of one step of the encoder."""
-
-    def __init__(self, model: Any, normalize: bool, compilation: Compilation) -> None:
-        self._model = model
-        self._normalized = normalizer(normalize)
-        self._encode = compilation.core("encode", self._features)
-
-    def __call__(self, pixels: Sequence[np.ndarray]) -> Any:
-        """Compute features (B, N, F) of images, each (3, side, side) float32."""
-        images = require("torch").as_tensor(np.stack(pixels))
-        return self._encode(images.to(self._model.device, self._model.dtype, non_blocking=True))
-
-    def _features(self, images: Any) -> Any:
-        clip = images[:, None].repeat(1, 2, 1, 1, 1)
-        return self._normalized(self._model(pixel_values_videos=clip, skip_predictor=True).last_hidden_state.float())
-
-
-def normalizer(normalize: bool) -> Callable[[Any], Any]:
-    """Return a function that normalises features (..., F), or returns them unchanged if not `normalize`."""
-    layer_norm = require("torch").nn.functional.layer_norm
-    return lambda features: layer_norm(features, features.shape[-1:]) if normalize else features
 
 
 def load_encoder(config: VJepa2AcConfig, saved: Mapping[str, Any] | None) -> Any:
@@ -186,7 +157,7 @@ def _renamed(saved: Mapping[str, Any]) -> dict[str, Any]:
     return tensors
 
 
-_PREFIXES = ("module.", "backbone.")  # added by distributed training and upstream's wrapper
+_PREFIXES = re.compile(r"module\.|backbone\.")  # added by distributed training and upstream's wrapper
 
 
 def read_checkpoint(config: VJepa2AcConfig) -> dict[str, dict[str, Any]]:
@@ -205,7 +176,11 @@ def read_checkpoint(config: VJepa2AcConfig) -> dict[str, dict[str, Any]]:
         raise ConfigError(
             f"checkpoint {file}: got {got}, want 'predictor' among them; is it V-JEPA 2-AC's, and not V-JEPA 2's?"
         )
-    return {name: _clean(part) for name, part in parts.items() if isinstance(part, Mapping)}
+    return {
+        name: {_PREFIXES.sub("", str(key)): tensor for key, tensor in part.items()}
+        for name, part in parts.items()
+        if isinstance(part, Mapping)
+    }
 
 
 def load_predictor(config: VJepa2AcConfig, saved: Mapping[str, Any], width: int) -> Any:
@@ -262,15 +237,6 @@ def _only(folder: Path) -> Path:
     return files[0]
 
 
-def _clean(part: Mapping[str, Any]) -> dict[str, Any]:
-    cleaned = {}
-    for name, tensor in part.items():
-        for prefix in _PREFIXES:
-            name = str(name).replace(prefix, "")  # noqa: PLW2901 - step by step
-        cleaned[str(name)] = tensor
-    return cleaned
-
-
 Tensor = Any  # torch's
 World = Callable[[Tensor, Tensor, Tensor], Tensor]
 """Predicts the next frame's features (M, N, F) from features (M, T, N, F), actions (M, T, 7) and poses (M, T, 7)."""
@@ -304,8 +270,8 @@ def plan(world: World, features: Tensor, poses: Tensor, goals: Tensor, noise: Te
     mean = torch.zeros(len(poses), config.rollout, DRAWN, device=poses.device)
     std = torch.ones_like(mean)
     std[..., :3] = config.maxnorm
-    keep_mean = _momentum(mean, config.momentum_mean, config.momentum_mean_gripper)
-    keep_std = _momentum(mean, config.momentum_std, config.momentum_std_gripper)
+    keep_mean = mean.new_tensor([config.momentum_mean] * 3 + [config.momentum_mean_gripper])
+    keep_std = mean.new_tensor([config.momentum_std] * 3 + [config.momentum_std_gripper])
     energy = torch.zeros(len(poses), 0)
     for draws in noise.unbind(1):
         tried = _bounded(draws * std[:, :, None] + mean[:, :, None], config)  # (B, H, S, 4)
@@ -317,10 +283,6 @@ def plan(world: World, features: Tensor, poses: Tensor, goals: Tensor, noise: Te
     gripper = mean[..., 3:]
     rested = torch.cat([mean[..., :3], torch.where(gripper.abs() < _GRIPPER_REST, 0.0, gripper)], -1)
     return Plans(_actions(rested), _actions(std), energy.min(1).values)
-
-
-def _momentum(like: Tensor, position: float, gripper: float) -> Tensor:
-    return like.new_tensor([position] * 3 + [gripper])
 
 
 def _bounded(tried: Tensor, config: VJepa2AcConfig) -> Tensor:
@@ -382,19 +344,29 @@ class WorldModel:
     def __init__(
         self, encoder: Any, predictor: Any, config: VJepa2AcConfig, dtype: Any, compilation: Compilation
     ) -> None:
-        self.encode = Encoder(encoder, config.normalize, compilation)
-        self._predictor = predictor
+        self._encoder, self._predictor = encoder, predictor
+        self._encode = compilation.core("encode", self._features)
         self._following = [  # by the number of known frames
             compilation.core(f"predict frame {frames + 1}", self._predict, config.plans_a_pass)
             for frames in range(1, config.rollout + 1)
         ]
-        self._normalized = normalizer(config.normalize)
+        layer_norm = require("torch").nn.functional.layer_norm
+        self._normalized: Any = lambda found: layer_norm(found, found.shape[-1:]) if config.normalize else found
         self._device, self._dtype = encoder.device.type, dtype
 
     def autocast(self) -> Any:
         """Return a context that computes in `dtype`, as in upstream's training; attention needs weights of one type."""
         torch = require("torch")
         return torch.autocast(self._device, self._dtype, enabled=self._dtype != torch.float32)
+
+    def encode(self, pixels: Sequence[np.ndarray]) -> Tensor:
+        """Compute features (B, N, F) of still images, each (3, side, side) float32."""
+        images = require("torch").as_tensor(np.stack(pixels))
+        return self._encode(images.to(self._encoder.device, self._encoder.dtype, non_blocking=True))
+
+    def _features(self, images: Tensor) -> Tensor:
+        clip = images[:, None].repeat(1, 2, 1, 1, 1)  # the two frames of one step of the encoder
+        return self._normalized(self._encoder(pixel_values_videos=clip, skip_predictor=True).last_hidden_state.float())
 
     def __call__(self, features: Tensor, actions: Tensor, poses: Tensor) -> Tensor:
         """Predict the next frame's features (see `World`)."""
@@ -421,10 +393,12 @@ class VJepa2Ac(ModelPolicy):
 
     @property
     def contract(self) -> Contract:
-        return Contract(
-            cameras=camera_specs(self._cameras),
+        return self.stated(
+            self._cameras,
+            [*self._state, GRIPPER],
+            self.config.rollout,
             state=state_specs(self._state, 6),
-            gripper=True,
+            instruction=None,
             action=ActionSpec(
                 dim=7,
                 space="ee_pose",
@@ -434,7 +408,7 @@ class VJepa2Ac(ModelPolicy):
                 gripper_open=1.0,
                 gripper_closed=0.0,
             ),
-            chunk=self.chunk(self.config.rollout),
+            history=None,
         )
 
     def load(self) -> WorldModel:
@@ -465,12 +439,10 @@ class VJepa2Ac(ModelPolicy):
         return Frame(to_pixels(image, self.config.image_size), pose)
 
     def predict(self, rows: Sequence[Row]) -> list[Prediction | Exception]:
-        ready = [row for row in rows if _GOAL in row.memory]
-        found = iter(self._plans(ready) if ready else [])
         no_goal = InvalidObservation(
             f"info[{GOAL_IMAGE!r}]: got none since the reset, want an image of the goal, (H, W, 3) uint8"
         )
-        return [next(found) if _GOAL in row.memory else no_goal for row in rows]
+        return of_good([row if _GOAL in row.memory else no_goal for row in rows], self._plans)
 
     def _plans(self, rows: Sequence[Row]) -> list[Prediction]:
         torch = require("torch")

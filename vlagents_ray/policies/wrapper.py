@@ -9,6 +9,7 @@ from typing import Any
 from vlagents_ray.contract import Contract
 from vlagents_ray.errors import ConfigError
 from vlagents_ray.interface import Act, Agent, Obs
+from vlagents_ray.policies.outcomes import of_good
 from vlagents_ray.registry import policy_class, wrapper_class
 from vlagents_ray.settings import wrong_settings
 
@@ -79,11 +80,8 @@ class Wrapper(Agent, abc.ABC):
         """Change the observations, and compute the inner agent's actions for those without an exception."""
         changed = self.change_batch(obs, sessions)  # type: ignore[arg-type]
         good = [i for i, one in enumerate(changed) if not isinstance(one, Exception)]
-        acts = self.agent.act_batch([changed[i] for i in good], [sessions[i].agent for i in good])  # type: ignore[misc, attr-defined]
-        results: list[Any] = list(changed)
-        for i, act in zip(good, acts, strict=True):
-            results[i] = act
-        return results
+        inner = [sessions[i].agent for i in good]  # type: ignore[attr-defined]
+        return of_good(changed, lambda observations: self.agent.act_batch(observations, inner))
 
     def sleep(self) -> None:
         self.agent.sleep()

@@ -94,10 +94,10 @@ class Dataset:
             folder,
             instruction,
             self.info["fps"],
-            self.info["features"] or None,
-            interventions=self.interventions,
-            lossless=self._lossless,
-            meaning=meaning,
+            self.info["features"],
+            self.interventions,
+            self._lossless,
+            meaning or ActionSpec(),
         )
 
     def save(self, episode: Finished) -> None:

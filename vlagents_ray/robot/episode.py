@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import shutil
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any, Literal
@@ -57,32 +57,21 @@ class Finished:
     folder: Path | None = None  # of the running episode, which is removed with the rest of its files
 
 
+@dataclass(slots=True, eq=False)
 class RobotEpisode:
     """A running episode, to which frames are added."""
 
-    def __init__(
-        self,
-        folder: Path,
-        instruction: str,
-        fps: float,
-        features: dict[str, Any] | None,
-        *,
-        interventions: bool = False,
-        lossless: bool = False,
-        meaning: ActionSpec | None = None,
-    ) -> None:
-        """Begin an episode with its videos in a folder; `features` are those of earlier episodes, None in the first."""
-        self.instruction = instruction
-        self.features: dict[str, Any] = features or {}
-        self.rows: dict[str, list[Any]] = {}
-        self.videos: dict[str, tuple[Path, Mp4]] = {}
-        self.images: dict[str, ImageStatistics] = {}
-        self._folder = folder
-        self._fps = fps
-        self._interventions = interventions
-        self._lossless = lossless
-        self._meaning = meaning or ActionSpec()
-        self._about = DatasetContract(Contract())
+    folder: Path  # of its videos
+    instruction: str
+    fps: float
+    features: dict[str, Any]  # those of earlier episodes; empty in the first
+    interventions: bool
+    lossless: bool
+    meaning: ActionSpec
+    rows: dict[str, list[Any]] = field(default_factory=dict)
+    videos: dict[str, tuple[Path, Mp4]] = field(default_factory=dict)
+    images: dict[str, ImageStatistics] = field(default_factory=dict)
+    about: DatasetContract = field(default_factory=lambda: DatasetContract(Contract()))
 
     def add(
         self,
@@ -124,7 +113,7 @@ class RobotEpisode:
         }
         if len(values):
             frame[STATE] = values
-        if self._interventions:
+        if self.interventions:
             policy = wanted if safe or intervention else action
             frame[WANTED_ACTION] = np.zeros_like(frame[ACTION]) if policy is None else np.asarray(policy, np.float32)
             frame |= {INTERVENTION_COLUMN: intervention, "policy_known": policy is not None}
@@ -144,31 +133,31 @@ class RobotEpisode:
             },
             {key: images.result() for key, images in self.images.items()},
             {key: path for key, (path, _) in self.videos.items()},
-            self._about,
+            self.about,
             label,
-            self._folder,
+            self.folder,
         )
 
     def abandon(self) -> None:
         """Remove the episode's files."""
         for _, video in self.videos.values():
             video.abandon()
-        shutil.rmtree(self._folder, ignore_errors=True)
+        shutil.rmtree(self.folder, ignore_errors=True)
 
     def _first(self, obs: Obs, names: list[str], action_dim: int, more: Mapping[str, Any]) -> None:
         features: dict[str, Any] = {}
         keys = camera_keys(obs.cameras)
         for name, image in sorted(obs.cameras.items()):
             key = keys[name]
-            path = self._folder / f"{key}.mp4"
-            video = Mp4(path, image.shape, self._fps, key_frames=_KEY_FRAMES, lossless=self._lossless)
+            path = self.folder / f"{key}.mp4"
+            video = Mp4(path, image.shape, self.fps, key_frames=_KEY_FRAMES, lossless=self.lossless)
             self.videos[key], self.images[key] = (path, video), ImageStatistics()
             height, width = video.size
-            features[key] = video_feature(height, width, self._fps, "gbrp" if self._lossless else "yuv420p")
+            features[key] = video_feature(height, width, self.fps, "gbrp" if self.lossless else "yuv420p")
         if names:
             features[STATE] = vector_feature(names)
         features[ACTION] = vector_feature([f"action_{i}" for i in range(action_dim)])
-        if self._interventions:
+        if self.interventions:
             features |= {WANTED_ACTION: features[ACTION]} | number_features(INTERVENTIONS)
         features |= number_features(MOMENTS | INDEX)
         for name, value in more.items():
@@ -180,13 +169,13 @@ class RobotEpisode:
         self.features = features
         parts = parts_of(obs.state, obs.gripper is not None)
         own = [part for part in parts if part != GRIPPER or obs.gripper is None]
-        self._about = DatasetContract(
+        self.about = DatasetContract(
             Contract(
                 cameras={name: CameraSpec(*image.shape[:2]) for name, image in obs.cameras.items()},
                 state={part: StateSpec(len(obs.state[part])) for part in own},
                 gripper=obs.gripper is not None,
-                action=replace(self._meaning, dim=action_dim),
-                control_hz=self._fps,
+                action=replace(self.meaning, dim=action_dim),
+                control_hz=self.fps,
             ),
             tuple(parts),
             {key: name for name, key in keys.items()},

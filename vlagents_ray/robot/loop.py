@@ -256,7 +256,9 @@ class _Run:
                     break
                 if self.watchdog is not None:
                     self.watchdog.heard("loop")
-                    self.watchdog.heard("server", _silent_s(act))
+                    ago_s: Any = act.info.get(SILENT)
+                    known = isinstance(ago_s, int | float) and 0 <= ago_s < math.inf
+                    self.watchdog.heard("server", float(ago_s) if known else 0.0)
                 if stop is not None:
                     self._stop(stop)
                     self.view.add(obs, act, None, tick, pacer.since_tick_s(), stop.reason)
@@ -336,12 +338,6 @@ def _shared_control(agent: Agent, watchdog: Watchdog | None, commands: CommandIn
 def _safe(act: Act) -> Held | None:
     """Return why the action of an agent is the safe one; None if it is the policy's or an operator's."""
     return Held(act.info.get(CAUSE, "other"), str(act.info[SAFE])) if SAFE in act.info else None
-
-
-def _silent_s(act: Act) -> float:
-    """Return the agent's waiting time for an answer, s; 0 if it states none."""
-    silent_s = act.info.get(SILENT)
-    return float(silent_s) if isinstance(silent_s, (int, float)) and 0 <= silent_s < math.inf else 0.0
 
 
 def _guard(agent: Agent, given: Guard | None) -> Guard:

@@ -7,8 +7,8 @@ import os
 import queue
 import threading
 import time
-from collections.abc import Iterator
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator
+from functools import partial
 from pathlib import Path
 from typing import get_args
 
@@ -20,21 +20,6 @@ from vlagents_ray.robot.dataset import Dataset
 from vlagents_ray.robot.episode import Label, RobotEpisode
 
 _NICE = 5  # the writing thread runs after the control loop's
-
-
-@dataclass(frozen=True, slots=True)
-class _Frame:
-    obs: Obs
-    action: np.ndarray
-    tick: int
-    safe: bool
-    intervention: bool
-    wanted: np.ndarray | None
-
-
-@dataclass(frozen=True, slots=True)
-class _End:
-    label: Label | None
 
 
 class Recorder:
@@ -67,8 +52,9 @@ class Recorder:
         self._dataset = Dataset(Path(root), fps, interventions=interventions)
         self._label: Label | None = None
         self._frames = frames
-        # A text begins an episode: its instruction.
-        self._queue: queue.SimpleQueue[_Frame | str | _End | None] = queue.SimpleQueue()
+        # What the thread does next, given the running episode; each returns the one that runs then. None ends it.
+        self._queue: queue.SimpleQueue[Callable[[RobotEpisode | None], RobotEpisode | None] | None]
+        self._queue = queue.SimpleQueue()
         self._put = 0  # frames added, counted by the loop's thread
         self._got = 0  # frames taken from the queue, counted by the writing thread
         self._thread = threading.Thread(target=self._run, name="vlagents-ray-recorder", daemon=True)
@@ -91,11 +77,11 @@ class Recorder:
         It is kept however the context ends, unless it has the label "discard".
         """
         self._label = None
-        self._queue.put(instruction)
+        self._queue.put(lambda _: self._dataset.begin(instruction))
         try:
             yield
         finally:
-            self._queue.put(_End(self._label))
+            self._queue.put(partial(self._end, self._label))
 
     def label(self, label: Label) -> None:
         """Label the running episode; the last label counts. May be called from any thread.
@@ -138,8 +124,16 @@ class Recorder:
             return
         if CAPTURED not in obs.info:
             obs = Obs(obs.cameras, obs.gripper, obs.state, {CAPTURED: time.time()})
+        seen, applied = copied(obs), np.array(action)
+
+        def write(episode: RobotEpisode | None) -> RobotEpisode | None:
+            self._got += 1
+            if episode is not None:  # else it was abandoned after an error
+                episode.add(seen, applied, float(seen.info[CAPTURED]), tick, safe, intervention, wanted)
+            return episode
+
         self._put += 1
-        self._queue.put(_Frame(copied(obs), np.array(action), tick, safe, intervention, wanted))
+        self._queue.put(write)
 
     def close(self) -> None:
         """Write the frames in the queue, and raise the first error that occurred."""
@@ -161,10 +155,9 @@ class Recorder:
         with contextlib.suppress(OSError):
             os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), _NICE)
         episode: RobotEpisode | None = None
-        while (item := self._queue.get()) is not None:
-            self._got += isinstance(item, _Frame)
+        while (step := self._queue.get()) is not None:
             try:
-                episode = self._handle(item, episode)
+                episode = step(episode)
             except Exception as error:  # noqa: BLE001 - raised by `close`; the robot continues
                 self.error = self.error or error
                 if episode is not None:
@@ -173,17 +166,8 @@ class Recorder:
         if episode is not None:
             episode.abandon()
 
-    def _handle(self, item: _Frame | str | _End, episode: RobotEpisode | None) -> RobotEpisode | None:
-        if isinstance(item, str):
-            return self._dataset.begin(item)
-        if episode is None:  # abandoned after an error
-            return None
-        if isinstance(item, _Frame):
-            at = float(item.obs.info[CAPTURED])
-            episode.add(item.obs, item.action, at, item.tick, item.safe, item.intervention, item.wanted)
-            return episode
-        if episode.rows and item.label != "discard":
-            self._dataset.save(episode.finish(item.label))
-        else:
+    def _end(self, label: Label | None, episode: RobotEpisode | None) -> None:
+        if episode is not None and episode.rows and label != "discard":
+            self._dataset.save(episode.finish(label))
+        elif episode is not None:
             episode.abandon()
-        return None

@@ -109,8 +109,12 @@ class AxesLeader:
         moved[:n] = self._step * axes[:n]
         command = self._gripper(obs) if gripper else None
         if not spec.relative:
-            if self._target is None:
-                self._target = self._pose(obs, command)
+            if self._target is None and self._measure is not None:
+                self._target = np.array(self._measure(obs), np.float32)
+            elif self._target is None:
+                if "joints" not in obs.state:
+                    raise MissingState("joints", obs.state)
+                self._target = np.array([*obs.state["joints"], *([] if command is None else [command])], np.float32)
             moved = self._target + moved
             if spec.low is not None or spec.high is not None:
                 moved = np.clip(moved, spec.low, spec.high)
@@ -126,14 +130,6 @@ class AxesLeader:
             self._closed = not self._closed
         command = self._spec.gripper_closed if self._closed else self._spec.gripper_open
         return float(command or 0.0)
-
-    def _pose(self, obs: Obs, command: float | None) -> np.ndarray:
-        if self._measure is not None:
-            return np.array(self._measure(obs), np.float32)
-        if "joints" not in obs.state:
-            raise MissingState("joints", obs.state)
-        joints = obs.state["joints"]
-        return np.array([*joints, *([] if command is None else [command])], np.float32)
 
 
 # A keyboard as a device with axes, read from the terminal so that it also works over SSH.
@@ -179,7 +175,6 @@ class Keyboard(AxesDevice):
         self._open.close()
 
     def engaged(self) -> bool:
-        """Read the pressed keys, and return whether the operator moves the robot."""
         if not self._terminal.read(self._press):
             raise ConnectionError("the terminal is closed")
         return self._taken
@@ -243,32 +238,26 @@ class SpaceMouse(AxesDevice):
         self._device.close()
 
     def engaged(self) -> bool:
-        """Read the device, and return whether the operator moves the robot."""
         read = None
         for _ in range(_REPORTS):
             state = self._device.read()
             if state.t == read:
                 break
             read = state.t
-            self._note(list(state.buttons))
+            before, self._buttons = self._buttons or [0] * len(state.buttons), list(state.buttons)
+            pressed = [now > then for now, then in zip(self._buttons, before, strict=True)]
+            if pressed and pressed[0]:
+                self._presses += 1
+                self._taken = True
+            if len(pressed) > 1 and pressed[-1]:
+                self._taken = not self._taken
         axes = np.array([state.x, state.y, state.z, state.roll, state.pitch, state.yaw], np.float32)
         self._axes = np.where(np.abs(axes) < _DEAD, 0, np.clip(axes, -1, 1)).astype(np.float32)
         self._taken = self._taken or bool(self._axes.any())
         return self._taken
 
     def axes(self) -> np.ndarray:
-        """Return the axes as read last, (6,), each in [-1, 1]."""
         return self._axes
-
-    def _note(self, buttons: list[int]) -> None:
-        before = self._buttons or [0] * len(buttons)
-        pressed = [now > then for now, then in zip(buttons, before, strict=True)]
-        self._buttons = buttons
-        if pressed and pressed[0]:
-            self._presses += 1
-            self._taken = True
-        if len(pressed) > 1 and pressed[-1]:
-            self._taken = not self._taken
 
 
 # An operator as an agent, for demonstrations in the same loop as a policy.

@@ -13,6 +13,7 @@ import json
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -79,12 +80,8 @@ def read_request(payload: bytes | memoryview, limits: Limits) -> GR00TRequest:
 
     def array(node: dict[Any, Any]) -> Any:
         nonlocal packed
-        if "__ndarray_class__" in node:
-            return read_npy(node.get("as_npy"), limits)
-        if msgpack.is_packed(node):
-            packed = True
-            return msgpack.read_packed(node)
-        return node
+        packed = packed or msgpack.is_packed(node)
+        return _array(node, limits)
 
     document = msgpack.unpack(payload, limits, array, text=limits.text)
     if not isinstance(document, dict):
@@ -274,6 +271,13 @@ def read_npy(data: Any, limits: Limits) -> Any:
     return read_array(content, dtype, shape[::-1]).T if by_columns else read_array(content, dtype, shape)
 
 
+def _array(node: dict[Any, Any], limits: Limits) -> Any:
+    """Return the array that a map of either format stands for; any other map unchanged."""
+    if "__ndarray_class__" in node:
+        return read_npy(node.get("as_npy"), limits)
+    return msgpack.read_packed(node) if msgpack.is_packed(node) else node
+
+
 def write_npy(value: Any) -> dict[str, Any]:
     """Return the map with an array as an .npy file, for msgpack."""
     if isinstance(value, (np.ndarray, np.generic)):
@@ -303,14 +307,6 @@ PRESETS: dict[str, dict[str, Any]] = {
 _KEYS_AT_MOST = 64
 _ARRAYS = ("video", "state")
 _PACKED = "__ModalityConfig__"  # older servers write `__ModalityConfig_class__`
-
-
-@dataclass(frozen=True, slots=True)
-class Modality:
-    """A server's description of one modality: its keys, and the time steps of each."""
-
-    keys: tuple[str, ...]
-    steps: tuple[int, ...]
 
 
 def batch(observations: Sequence[Mapping[str, Any]], text_key: str) -> dict[str, Any]:
@@ -346,20 +342,13 @@ def flat(batched: Mapping[str, Any]) -> dict[str, Any]:
 
 def write(endpoint: str, data: Any, api_token: str | None, *, packed: bool = False) -> bytes:
     """Return the message of a request; `data` is omitted if it is None; `packed` is the result of `reads_packed`."""
-    array = msgpack.write_packed if packed else write_npy
     message = {"endpoint": endpoint} | ({} if data is None else {"data": data})
-    return msgpack.pack(message | ({"api_token": api_token} if api_token else {}), array)
+    return pack(message | ({"api_token": api_token} if api_token else {}), packed=packed)
 
 
 def read(payload: bytes, limits: Limits = DEFAULT_LIMITS) -> Any:
     """Return the value of a reply; raise `MalformedMessage` or `MessageTooLarge` if it is invalid."""
-
-    def array(node: dict[Any, Any]) -> Any:
-        if "__ndarray_class__" in node:
-            return read_npy(node.get("as_npy"), limits)
-        return msgpack.read_packed(node) if msgpack.is_packed(node) else node
-
-    return msgpack.unpack(payload, limits, array)
+    return msgpack.unpack(payload, limits, partial(_array, limits=limits))
 
 
 def read_actions(reply: Any, number: int) -> list[dict[str, np.ndarray]]:
@@ -387,14 +376,14 @@ def reads_packed(reply: Any) -> bool:
     return isinstance(reply, dict) and any(isinstance(one, dict) and _PACKED in one for one in reply.values())
 
 
-def read_modalities(reply: Any) -> dict[str, Modality]:
-    """Return the modalities in the reply to `get_modality_config`; keys have no prefix such as `video.`."""
+def read_modalities(reply: Any) -> dict[str, dict[str, list[Any]]]:
+    """Return "keys" and "steps" by modality in the reply to `get_modality_config`; keys lack the prefix `video.`."""
     if not isinstance(reply, dict):
         raise MalformedMessage(f"gr00t: got {type(reply).__name__} for modalities, want a map")
     return {str(name): _modality(str(name), value) for name, value in list(reply.items())[:_KEYS_AT_MOST]}
 
 
-def _modality(name: str, value: Any) -> Modality:
+def _modality(name: str, value: Any) -> dict[str, list[Any]]:
     config = value.get("as_json", value) if isinstance(value, dict) else None
     if isinstance(config, str):
         try:
@@ -408,4 +397,4 @@ def _modality(name: str, value: Any) -> Modality:
     if not all(isinstance(key, str) for key in keys) or not all(type(step) is int for step in steps):
         raise MalformedMessage(f"gr00t: modality {name[:40]!r}: want texts and whole numbers in its lists")
     shown = keys if name == "language" else [key.removeprefix(f"{name}.") for key in keys]
-    return Modality(tuple(shown[:_KEYS_AT_MOST]), tuple(steps))
+    return {"keys": shown[:_KEYS_AT_MOST], "steps": steps}

@@ -222,16 +222,8 @@ class TransferState(enum.IntEnum):
     END = 3
 
 
-@dataclass(frozen=True, slots=True)
-class ObservationPart:
-    """A part of a pickled observation."""
-
-    state: TransferState
-    data: memoryview
-
-
-def read_observation_part(message: bytes) -> ObservationPart:
-    """Return the content of an `Observation`; raise `MalformedMessage` for anything else."""
+def read_observation_part(message: bytes) -> tuple[TransferState, memoryview]:
+    """Return the content of an `Observation`, a part of a pickle; raise `MalformedMessage` for anything else."""
     number, data = 0, memoryview(b"")
     for field, value in _protobuf_fields(message):
         if field == 1 and isinstance(value, int):
@@ -239,22 +231,24 @@ def read_observation_part(message: bytes) -> ObservationPart:
         elif field == 2 and isinstance(value, memoryview):
             data = value
     try:
-        return ObservationPart(TransferState(number), data)
+        return TransferState(number), data
     except ValueError as error:
         raise MalformedMessage(f"observation: got transfer state {number}, want 1, 2 or 3") from error
 
 
 def read_data(message: bytes) -> memoryview | None:
     """Return the pickle in a `PolicySetup` or an `Actions`; None if it has none."""
-    for field, value in _protobuf_fields(message):
-        if field == 1 and isinstance(value, memoryview):
-            return value
-    return None
+    fields = _protobuf_fields(message)
+    return next((value for field, value in fields if field == 1 and isinstance(value, memoryview)), None)
 
 
 def write_data(data: bytes) -> bytes:
     """Return a `PolicySetup` or an `Actions` with a pickle."""
-    return _head(1, len(data)) + data
+    size, length = bytearray(), len(data)
+    while length > 0x7F:
+        size.append(length & 0x7F | 0x80)
+        length >>= 7
+    return bytes([1 << 3 | _BYTES, *size, length]) + data
 
 
 def method(name: str) -> str:
@@ -262,14 +256,6 @@ def method(name: str) -> str:
 
 
 EMPTY = b""  # an `Empty`, and an `Actions` without a pickle
-
-
-def _head(number: int, length: int) -> bytes:
-    size = bytearray()
-    while length > 0x7F:
-        size.append(length & 0x7F | 0x80)
-        length >>= 7
-    return bytes([number << 3 | _BYTES, *size, length])
 
 
 def _protobuf_fields(message: bytes) -> Iterator[tuple[int, int | memoryview]]:

@@ -217,10 +217,6 @@ def leaves(nested: Mapping[Any, Any], prefix: str = "") -> list[tuple[str, Any]]
     return found[:_SHOWN]
 
 
-def reads(key: str, path: str) -> bool:
-    return any(matches(path, one) for one in key.split("|"))
-
-
 def matches(name: str, pattern: str) -> bool:
     """Return whether `pattern`, which may end with `*`, matches `name`."""
     return name.startswith(pattern[:-1]) if pattern.endswith("*") else name == pattern
@@ -502,10 +498,11 @@ class KeyMapping:
         """Return the paths of the values for which `is_one` is true and which no key of the mapping matches."""
         known = [one.key for one in self.cameras.values()] + [one.key for all_ in self.state.values() for one in all_]
         known += [*self.info.values(), *([] if self.gripper is None else [self.gripper.key])]
+        patterns = [pattern for key in known for pattern in key.split("|")]
         return [
             short_path(path)
             for path, value in leaves(flat)
-            if is_one(value) and not any(reads(key, path) for key in known)
+            if is_one(value) and not any(matches(path, pattern) for pattern in patterns)
         ]
 
     def _require_read(self, flat: Mapping[str, Any], obs: Obs) -> None:

@@ -121,16 +121,13 @@ PRESETS: dict[str, dict[str, Any]] = {
 
 ROBOARENA: dict[str, dict[str, Any]] = {
     # openpi's DROID keys, but the camera numbers begin with 0
-    "roboarena": {
+    "roboarena": PRESETS["openpi-droid"]
+    | {
         "cameras": {
             "front": {"key": "observation/exterior_image_0_left", "layout": "any"},
             "front_2": {"key": "observation/exterior_image_1_left", "layout": "any", "optional": True},
             "wrist": {"key": "observation/wrist_image_left", "layout": "any", "optional": True},
         },
-        "state": {"joints": {"key": "observation/joint_position", "stop": 7}},
-        "gripper": {"key": "observation/gripper_position", "open": 0.0, "closed": 1.0},
-        "instruction": "prompt",
         "info": {"session_id": "session_id"},
-        "action_gripper": {"index": 7, "open": 0.0, "closed": 1.0},
     }
 }

@@ -30,8 +30,9 @@ def decode(body: bytes, limits: Limits = DEFAULT_LIMITS) -> tuple[dict[str, Any]
     return payload, twice
 
 
-def encode(action: np.ndarray | Sequence[np.ndarray], twice: bool) -> bytes:
-    text = json_numpy.dumps(action)
+def encode(value: np.ndarray | Sequence[np.ndarray] | Mapping[str, Any], twice: bool = False) -> bytes:
+    """Return the body with an action or an observation."""
+    text = json_numpy.dumps(value)
     return (json.dumps(text) if twice else text).encode()
 
 
@@ -40,10 +41,6 @@ def _load(text: bytes, limits: Limits) -> dict[str, Any]:
     if not isinstance(payload, dict):
         raise MalformedMessage(f"body: got {type(payload).__name__}, want an object")
     return payload
-
-
-def encode_observation(observation: Mapping[str, Any]) -> bytes:
-    return json_numpy.dumps(observation).encode()
 
 
 def decode_action(body: bytes, limits: Limits = DEFAULT_LIMITS) -> np.ndarray | None:

@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import struct
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -33,24 +34,20 @@ class Name(NamedTuple):
     name: str
 
 
+@dataclass(slots=True, eq=False)
 class Record:
     """An object of a data class, known only by name and fields."""
 
-    __slots__ = ("fields", "name")
-
-    def __init__(self, name: Name) -> None:
-        self.name = name
-        self.fields: dict[str, Any] | None = None  # None until they are read
+    name: Name
+    fields: dict[str, Any] | None = None  # None until they are read
 
 
+@dataclass(slots=True, eq=False)
 class Reduced:
     """An object that a pickle creates by a call, and whose state may follow."""
 
-    __slots__ = ("read_state", "value")
-
-    def __init__(self, read_state: Callable[[Any], Any] | None = None, value: Any = None) -> None:
-        self.read_state = read_state
-        self.value = value  # None until its state is read
+    read_state: Callable[[Any], Any] | None = None
+    value: Any = None  # None until its state is read
 
 
 Call = Callable[[tuple[Any, ...]], "Reduced | int | float"]

@@ -12,7 +12,6 @@ from __future__ import annotations
 
 import struct
 import zlib
-from collections.abc import Callable
 from dataclasses import dataclass
 from enum import IntEnum
 from typing import Any
@@ -27,7 +26,7 @@ _METHOD_CLASS = "builtins.method"  # peers know this class and do not inspect it
 _METHODS_AT_MOST = 64
 _COMPRESS_OVER = 3000  # bytes, RPyC's own threshold
 _REQUEST, _REPLY, _EXCEPTION = 1, 2, 3
-_VALUE, _TUPLE, _LOCAL, _REMOTE = 1, 2, 3, 4  # labels of boxed values
+VALUE, TUPLE, LOCAL, REMOTE = 1, 2, 3, 4  # labels of boxed values; a local one is the receiver's own object
 
 
 class Handler(IntEnum):
@@ -106,13 +105,13 @@ class Refused(MalformedMessage):
 
 def reply(sequence: int, value: Any) -> bytes:
     """Return the frame of a reply with a value: None, bool, int, float, text, bytes or tuples of these."""
-    return _frame(_REPLY, (sequence, (_VALUE, value)))
+    return _frame(_REPLY, (sequence, (VALUE, value)))
 
 
 def reference_reply(sequence: int, number: int) -> bytes:
     """Return the frame of a reply with a reference to the root, or to one of its methods."""
     name = _ROOT_NAME if number == ROOT else (_METHOD_CLASS, 2, number)
-    return _frame(_REPLY, (sequence, (_REMOTE, name)))
+    return _frame(_REPLY, (sequence, (REMOTE, name)))
 
 
 def exception(sequence: int, kind: str, text: str) -> bytes:
@@ -121,21 +120,8 @@ def exception(sequence: int, kind: str, text: str) -> bytes:
 
 
 def request(sequence: int, handler: Handler, boxed_args: tuple[int, Any]) -> bytes:
-    """Return the frame of a request to a server, with its arguments in boxes."""
+    """Return the frame of a request to a server, with its arguments in boxes: a label, and a value or boxes."""
     return _frame(_REQUEST, (sequence, (int(handler), boxed_args)))
-
-
-def boxed_value(value: Any) -> tuple[int, Any]:
-    return _VALUE, value
-
-
-def boxed_tuple(*boxes: tuple[int, Any]) -> tuple[int, Any]:
-    return _TUPLE, boxes
-
-
-def boxed_reference(name: tuple[Any, ...]) -> tuple[int, Any]:
-    """Return the box of a reference to the peer's own object, by the peer's name for it."""
-    return _LOCAL, name
 
 
 def read_reply(body: bytes | bytearray, compressed: bool, limit: int) -> tuple[int, bool, Any] | None:
@@ -153,7 +139,15 @@ def _message(body: bytes | bytearray, compressed: bool, limit: int) -> memoryvie
     """Return the message in a frame's body, which has at least one byte."""
     message = memoryview(body)[: -len(END)]
     if compressed:
-        message = memoryview(_inflate(message, limit))
+        machine = zlib.decompressobj()
+        try:
+            message = memoryview(machine.decompress(message, limit + 1))
+        except zlib.error as error:
+            raise MalformedMessage(f"rpyc: not compressed as its header says ({error})") from error
+        if len(message) > limit:
+            raise MessageTooLarge(f"rpyc: a message of more than {limit} bytes")
+        if not machine.eof:
+            raise MalformedMessage("rpyc: a compressed message without an end")
     if len(message) == 0:
         raise MalformedMessage("rpyc: an empty message")
     return message
@@ -167,28 +161,15 @@ def _frame(kind: int, content: tuple[Any, ...]) -> bytes:
     return HEADER.pack(len(message), compressed) + message + END
 
 
-def _inflate(data: memoryview, limit: int) -> bytes:
-    machine = zlib.decompressobj()
-    try:
-        message = machine.decompress(data, limit + 1)
-    except zlib.error as error:
-        raise MalformedMessage(f"rpyc: not compressed as its header says ({error})") from error
-    if len(message) > limit:
-        raise MessageTooLarge(f"rpyc: a message of more than {limit} bytes")
-    if not machine.eof:
-        raise MalformedMessage("rpyc: a compressed message without an end")
-    return message
-
-
 def _unbox(boxed: Any) -> Any:
     if not (isinstance(boxed, tuple) and len(boxed) == 2):
         raise MalformedMessage("rpyc: want (label, value)")
     label, value = boxed
-    if label == _VALUE:
+    if label == VALUE:
         return value
-    if label == _TUPLE and isinstance(value, tuple):
+    if label == TUPLE and isinstance(value, tuple):
         return tuple(_unbox(item) for item in value)
-    if label == _LOCAL and isinstance(value, tuple) and len(value) == 3:
+    if label == LOCAL and isinstance(value, tuple) and len(value) == 3:
         if value == _ROOT_NAME:
             return Reference(ROOT)
         if value[:2] == (_METHOD_CLASS, 2) and _is_int(value[2]) and 0 < value[2] < _METHODS_AT_MOST:
@@ -217,9 +198,20 @@ def read_brine(data: memoryview) -> Any:
 
 def write_brine(value: Any) -> bytes:
     """Return a value in brine, the inverse of `read_brine`; raise `TypeError` for an unsupported type."""
-    parts: list[bytes] = []
-    _write(value, parts)
-    return b"".join(parts)
+    if value is None or isinstance(value, bool):
+        return {None: b"\x00", True: b"\x03", False: b"\x04"}[value]
+    if isinstance(value, int):
+        digits = str(value).encode()
+        return bytes([value + 0x50]) if -0x30 <= value < 0xA0 else b"\x16" + bytes([len(digits)]) + digits
+    if isinstance(value, float):
+        return b"\x18" + _F8.pack(value)
+    if isinstance(value, str):
+        return b"\x08" + write_brine(value.encode())
+    if isinstance(value, bytes):
+        return b"\x0f" + _U4.pack(len(value)) + value if value else b"\x01"
+    if isinstance(value, tuple):
+        return b"".join([b"\x15" + _U4.pack(len(value)), *map(write_brine, value)]) if value else b"\x02"
+    raise TypeError(f"brine: cannot send {type(value).__name__}")
 
 
 class _BrineReader:
@@ -256,11 +248,11 @@ class _BrineReader:
         if tag == 0x08:
             return self._text(depth)
         if tag in _BYTES:
-            return bytes(self._take(_BYTES[tag](self)))
+            return bytes(self._take(self._length(_BYTES[tag])))
         if tag in _TUPLES:
-            return self._tuple(_TUPLES[tag](self), depth)
+            return self._tuple(self._length(_TUPLES[tag]), depth)
         if tag in _INTS:
-            return self._integer(_INTS[tag](self))
+            return self._integer(self._length(_INTS[tag]))
         raise MalformedMessage(f"brine: got a value of kind {tag:#04x}, want text, numbers or tuples")
 
     def _text(self, depth: int) -> str:
@@ -284,44 +276,12 @@ class _BrineReader:
             raise MalformedMessage("brine: not a number")
         return int(digits)
 
-    def length1(self) -> int:
-        return self._take(1)[0]
-
-    def length4(self) -> int:
-        return int(_U4.unpack(self._take(4))[0])
-
-
-def _fixed(length: int) -> Callable[[_BrineReader], int]:
-    return lambda _: length
+    def _length(self, length: int) -> int:
+        return length if length > 0 else int.from_bytes(self._take(-length), "big")
 
 
 _SINGLE: dict[int, Any] = {0x00: None, 0x01: b"", 0x02: (), 0x03: True, 0x04: False}
-_BYTES = {0x09 + n: _fixed(n) for n in (1, 2, 3, 4)} | {0x0E: _BrineReader.length1, 0x0F: _BrineReader.length4}
-_TUPLES = {0x0F + n: _fixed(n) for n in (1, 2, 3, 4)} | {0x14: _BrineReader.length1, 0x15: _BrineReader.length4}
-_INTS = {0x16: _BrineReader.length1, 0x17: _BrineReader.length4}
-
-
-def _write(value: Any, parts: list[bytes]) -> None:
-    if value is None:
-        parts.append(b"\x00")
-    elif isinstance(value, bool):
-        parts.append(b"\x03" if value else b"\x04")
-    elif isinstance(value, int):
-        if -0x30 <= value < 0xA0:
-            parts.append(bytes([value + 0x50]))
-        else:
-            digits = str(value).encode()
-            parts.append(b"\x16" + bytes([len(digits)]) + digits)
-    elif isinstance(value, float):
-        parts.append(b"\x18" + _F8.pack(value))
-    elif isinstance(value, str):
-        parts.append(b"\x08")
-        _write(value.encode(), parts)
-    elif isinstance(value, bytes):
-        parts.append(b"\x01" if not value else b"\x0f" + _U4.pack(len(value)) + value)
-    elif isinstance(value, tuple):
-        parts.append(b"\x02" if not value else b"\x15" + _U4.pack(len(value)))
-        for item in value:
-            _write(item, parts)
-    else:
-        raise TypeError(f"brine: cannot send {type(value).__name__}")
+# Lengths by kind; -1 and -4: it is stated by the next one or four bytes.
+_BYTES = {0x0A: 1, 0x0B: 2, 0x0C: 3, 0x0D: 4, 0x0E: -1, 0x0F: -4}
+_TUPLES = {0x10: 1, 0x11: 2, 0x12: 3, 0x13: 4, 0x14: -1, 0x15: -4}
+_INTS = {0x16: -1, 0x17: -4}

@@ -6,8 +6,9 @@ its `reset`. A camera is an array, a JPEG file in base64, or the name of a share
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any, Protocol
 
 import numpy as np
@@ -69,22 +70,14 @@ class ObservationRequest:
     robots: tuple[str, ...]  # names in order; empty for vlagents 0.2, which has no names
 
 
-@dataclass(frozen=True, slots=True)
-class EpisodeStart:
-    """The arguments of `reset` in vlagents 0.2."""
-
-    seen: ObservationRequest
-    kwargs: dict[str, Any] = field(default_factory=dict)
-
-
 def read_act(text: str | bytes, budget: Budget, segments: Segments) -> ObservationRequest:
     """Return the observation of an `act`, and count it as a request."""
     budget.begin("act")
     return _read(json_numpy.loads(text, budget.limits, _LEVELS), budget, segments)
 
 
-def read_reset(text: str | bytes, budget: Budget, segments: Segments) -> EpisodeStart:
-    """Return the arguments of a `reset` of vlagents 0.2, `[observation, instruction, options]`, and count it."""
+def read_reset(text: str | bytes, budget: Budget, segments: Segments) -> tuple[ObservationRequest, dict[str, Any]]:
+    """Return the observation and the options of a `reset` of vlagents 0.2, and count it as a request."""
     budget.begin("reset")
     document = json_numpy.loads(text, budget.limits, _LEVELS)
     if not (isinstance(document, list) and len(document) == 3):
@@ -93,7 +86,7 @@ def read_reset(text: str | bytes, budget: Budget, segments: Segments) -> Episode
     kwargs = _mapping(document[2], "reset: options")
     if taken := kwargs.keys() & _TAKEN:
         raise MalformedMessage(f"reset: got the options {sorted(taken)}, which are no options")
-    return EpisodeStart(ObservationRequest(seen.obs, _instruction(document[1], budget.limits), seen.robots), kwargs)
+    return ObservationRequest(seen.obs, _instruction(document[1], budget.limits), seen.robots), kwargs
 
 
 def write_act(act: Act, robots: Sequence[str], parts: Mapping[str, Part] | None = None) -> str:
@@ -214,9 +207,7 @@ def _shared(payload: Mapping[str, Any], budget: Budget, segments: Segments) -> n
         raise MalformedMessage("shared memory: want a name, and pixels of uint8")
     if not (isinstance(shape, list) and 0 < len(shape) <= 4 and all(type(n) is int and n > 0 for n in shape)):
         raise MalformedMessage(f"shared memory: got the shape {shown(shape)}, want (H, W, 3)")
-    size = 1
-    for n in shape:
-        size *= n
+    size = math.prod(shape)
     if size > budget.limits.body_bytes:
         raise MessageTooLarge(f"shared memory: got {size} bytes, the limit is {budget.limits.body_bytes}")
     budget.hold(size)
@@ -259,16 +250,13 @@ class RemoteError:
 
 
 def get_root(sequence: int) -> bytes:
-    return rpyc.request(sequence, rpyc.Handler.GETROOT, rpyc.boxed_value(()))
+    return rpyc.request(sequence, rpyc.Handler.GETROOT, (rpyc.VALUE, ()))
 
 
 def call(sequence: int, root: tuple[Any, ...], method: str, *args: str) -> bytes:
     """Return the frame that calls a method of the server's root with text arguments."""
-    return rpyc.request(
-        sequence,
-        rpyc.Handler.CALLATTR,
-        rpyc.boxed_tuple(rpyc.boxed_reference(root), *map(rpyc.boxed_value, (method, args, ()))),
-    )
+    boxes = [(rpyc.LOCAL, root), *((rpyc.VALUE, value) for value in (method, args, ()))]
+    return rpyc.request(sequence, rpyc.Handler.CALLATTR, (rpyc.TUPLE, tuple(boxes)))
 
 
 def read_result(body: bytes | bytearray, compressed: bool, limit: int) -> tuple[int, Any] | None:

@@ -12,7 +12,7 @@ import torch
 from tests.families.vjepa2_ac.tiny import PATCH, SIDE, WIDTH, make_hf_encoder
 from vlagents_ray.errors import ConfigError
 from vlagents_ray.policies.compilation import Compilation
-from vlagents_ray.policies.vjepa2_ac import Encoder, VJepa2AcConfig, load_encoder, to_pixels
+from vlagents_ray.policies.vjepa2_ac import VJepa2AcConfig, WorldModel, load_encoder, to_pixels
 
 
 @pytest.fixture(scope="module")
@@ -29,12 +29,14 @@ def pixels(count: int) -> np.ndarray:
     return np.stack([to_pixels(rng.integers(0, 256, (40, 60, 3), dtype=np.uint8), SIDE) for _ in range(count)])
 
 
+def encoding(model: Any, normalize: bool) -> Any:
+    return WorldModel(model, None, config(normalize=normalize), torch.float32, Compilation(mode=False)).encode
+
+
 @torch.inference_mode()
 @pytest.mark.verifies("batches")
 def test_an_image_gives_the_same_features_in_a_batch_of_any_size(folder: Path) -> None:
-    encode = Encoder(
-        load_encoder(config(encoder=str(folder)), None).eval(), normalize=True, compilation=Compilation(mode=False)
-    )
+    encode = encoding(load_encoder(config(encoder=str(folder)), None).eval(), normalize=True)
     together = encode(pixels(8))
     assert together.shape == (8, (SIDE // PATCH) ** 2, WIDTH)
     for size in (1, 2, 3):
@@ -47,9 +49,7 @@ def test_an_image_gives_the_same_features_in_a_batch_of_any_size(folder: Path) -
 def test_features_are_those_of_transformers_for_an_image_shown_twice(folder: Path) -> None:
     model = load_encoder(config(encoder=str(folder)), None).eval()
     clip = torch.as_tensor(pixels(1))[:, None].expand(-1, 2, -1, -1, -1)
-    assert torch.equal(
-        Encoder(model, normalize=False, compilation=Compilation(mode=False))(pixels(1)), model.get_vision_features(clip)
-    )
+    assert torch.equal(encoding(model, normalize=False)(pixels(1)), model.get_vision_features(clip))
 
 
 def test_an_image_is_cut_to_the_square_in_its_middle() -> None:

@@ -19,7 +19,7 @@ from websockets.exceptions import ConnectionClosedError
 from vlagents_ray.errors import NoReplica, PolicyUnavailable, UnknownSession
 from vlagents_ray.evaluate import EvalConfig
 from vlagents_ray.interface import Obs
-from vlagents_ray.policies.upstream import Upstream, client
+from vlagents_ray.policies.upstream import Upstream, websocket
 from vlagents_ray.serve.models.agent_copies import AgentCopies
 from vlagents_ray.serve.ports import free_port
 
@@ -82,14 +82,14 @@ def test_the_rows_of_a_lost_lane_are_asked_over_the_others(opened: Open, start: 
     ports = [free_port(), free_port()]
     servers = [start(port, protocol) for port in ports]
     agent = opened(*ports, protocol=protocol)
-    wait_for(lambda: len(agent._lanes._wait_ready(0)) == 2)
+    wait_for(lambda: len(agent._lanes._ready) == 2)
     acting = sessions(agent, 8)
     require_right(agent, acting)
     servers[0].kill()
     servers[0].wait()
     require_right(agent, acting)
     start(ports[0], protocol)
-    wait_for(lambda: len(agent._lanes._wait_ready(0)) == 2)
+    wait_for(lambda: len(agent._lanes._ready) == 2)
     require_right(agent, acting)
 
 
@@ -109,7 +109,7 @@ def test_connections_that_ended_while_nobody_acted_cost_a_row_nothing(opened: Op
     port = free_port()
     server = start(port, protocol)
     agent = opened(port, protocol=protocol, mapping=PIXELS[protocol], connections=5, retry_s=60)
-    wait_for(lambda: len(agent._lanes._wait_ready(0)) == 5)
+    wait_for(lambda: len(agent._lanes._ready) == 5)
     image = np.zeros((8, 8, 3), np.uint8)
     obs = Obs({"front": image, "wrist": image}, state={"position": np.ones(1, np.float32)})
     [session] = sessions(agent, 1)
@@ -127,7 +127,7 @@ def test_a_connection_that_ends_in_its_handshake_is_tried_again(
 ) -> None:
     port, refused = free_port(), []
     start(port)
-    real = client.connect
+    real = websocket.connect
 
     def connect(*args: Any, **options: Any) -> Any:
         if len(refused) < 2:
@@ -135,7 +135,7 @@ def test_a_connection_that_ends_in_its_handshake_is_tried_again(
             raise ConnectionClosedError(None, None)  # as when the upstream is killed in the meantime
         return real(*args, **options)
 
-    monkeypatch.setattr(client, "connect", connect)
+    monkeypatch.setattr(websocket, "connect", connect)
     agent = opened(port)
     assert len(refused) == 2
     require_right(agent, sessions(agent, 1))

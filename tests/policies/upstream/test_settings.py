@@ -183,7 +183,7 @@ def test_connections_share_a_batch(serving: Serving) -> None:
 
     with Upstream.from_config({**OPENPI, "urls": [serving(answer)], "connections": 3}) as agent:
         agent.initialize()
-        wait_for(lambda: len(agent._lanes._wait_ready(0)) == 3)
+        wait_for(lambda: len(agent._lanes._ready) == 3)
         copies = AgentCopies(agent)
         sessions = [copies.make() for _ in range(3)]
         seen = Obs(state={"position": np.ones(1, np.float32)})

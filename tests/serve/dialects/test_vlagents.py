@@ -99,9 +99,9 @@ def test_of_several_frames_the_last_is_taken() -> None:
 
 def test_a_reset_of_0_2_brings_instruction_and_options() -> None:
     old = {"cameras": {}, "camera_data_type": "raw", "gripper": None, "state": np.ones(3), "info": {}}
-    episode = vlagents.read_reset(json_numpy.dumps([old, "go", {"seed": 4}]), Budget(LIMITS), Memory())
-    assert (episode.seen.instruction, episode.kwargs, episode.seen.robots) == ("go", {"seed": 4}, ())
-    assert episode.seen.obs.state["state"].dtype == np.float32
+    seen, read = vlagents.read_reset(json_numpy.dumps([old, "go", {"seed": 4}]), Budget(LIMITS), Memory())
+    assert (seen.instruction, read, seen.robots) == ("go", {"seed": 4}, ())
+    assert seen.obs.state["state"].dtype == np.float32
     for options in ({"obs": 1}, {"contract": {}}, 3):
         with pytest.raises(MalformedMessage, match="options"):
             vlagents.read_reset(json_numpy.dumps([old, "go", options]), Budget(LIMITS), Memory())

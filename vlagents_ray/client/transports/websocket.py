@@ -99,37 +99,6 @@ def open_websocket(url: str, credentials: Credentials, timeout_s: float) -> Prox
         raise NoReplica(f"{url}: cannot connect ({error}); is it running?") from error
 
 
-class _FrameMemory:
-    """Reusable memory for the frames that one connection sends.
-
-    Fresh memory, which the kernel clears page by page, costs more than all other work on a frame with images.
-    """
-
-    def __init__(self) -> None:
-        self._kept = bytearray(_KEPT_BYTES)
-
-    def frame(self, pieces: Sequence[Buffer]) -> memoryview:
-        """Return the frame of a binary message in pieces (RFC 6455, 5.2), which is valid until the next call."""
-        size = sum(map(len, pieces))
-        memory = self._kept if size <= _KEPT_BYTES - 2 * _HEAD_BYTES else bytearray(size + 2 * _HEAD_BYTES)
-        view, at = memoryview(memory), _HEAD_BYTES
-        for piece in pieces:
-            view[at : at + len(piece)] = piece
-            at += len(piece)
-        mask = secrets.token_bytes(4)
-        masked = np.frombuffer(memory, np.uint32, -(-size // 4), _HEAD_BYTES)
-        masked ^= np.frombuffer(mask, np.uint32)
-        if size < 126:
-            length = bytes([0x80 | size])
-        elif size < 2**16:
-            length = b"\xfe" + size.to_bytes(2, "big")
-        else:
-            length = b"\xff" + size.to_bytes(8, "big")
-        head = b"\x82" + length + mask
-        view[_HEAD_BYTES - len(head) : _HEAD_BYTES] = head
-        return view[_HEAD_BYTES - len(head) : at]
-
-
 class Stream:
     """A connection to a replica's own port, which the thread that waits for the answer reads and writes itself.
 
@@ -148,7 +117,8 @@ class Stream:
             logger=WEBSOCKET_LOG,
         )
         self._messages: list[bytes] = []
-        self._frames = _FrameMemory()
+        # Fresh memory, which the kernel clears page by page, costs more than all other work on a frame with images.
+        self._kept = bytearray(_KEPT_BYTES)
         self._read_memory = memoryview(bytearray(_READ_BYTES))
         self._silent = False  # whether the server failed to read or answer the last message in time
         self._socket = socket.create_connection((host, port), timeout_s)
@@ -179,7 +149,7 @@ class Stream:
         self._check_open()
         try:
             self._limit(time.monotonic() + timeout_s)
-            self._socket.sendall(self._frames.frame(pieces))
+            self._socket.sendall(self._frame(pieces))
         except TimeoutError as error:
             self._silent = True
             raise ConnectionAbortedError(f"the server took no message within {timeout_s:g} s") from error
@@ -210,6 +180,27 @@ class Stream:
                 self._protocol.send_close()
                 self._flush(time.monotonic() + 1.0)
         self._socket.close()
+
+    def _frame(self, pieces: Sequence[Buffer]) -> memoryview:
+        """Return the frame of a binary message in pieces (RFC 6455, 5.2), which is valid until the next call."""
+        size = sum(map(len, pieces))
+        memory = self._kept if size <= _KEPT_BYTES - 2 * _HEAD_BYTES else bytearray(size + 2 * _HEAD_BYTES)
+        view, at = memoryview(memory), _HEAD_BYTES
+        for piece in pieces:
+            view[at : at + len(piece)] = piece
+            at += len(piece)
+        mask = secrets.token_bytes(4)
+        masked = np.frombuffer(memory, np.uint32, -(-size // 4), _HEAD_BYTES)
+        masked ^= np.frombuffer(mask, np.uint32)
+        if size < 126:
+            length = bytes([0x80 | size])
+        elif size < 2**16:
+            length = b"\xfe" + size.to_bytes(2, "big")
+        else:
+            length = b"\xff" + size.to_bytes(8, "big")
+        head = b"\x82" + length + mask
+        view[_HEAD_BYTES - len(head) : _HEAD_BYTES] = head
+        return view[_HEAD_BYTES - len(head) : at]
 
     def _check_open(self) -> None:
         """Raise `ConnectionClosed` or `OSError` if the connection is closed, or is being closed by the server."""

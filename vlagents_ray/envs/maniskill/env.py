@@ -11,7 +11,7 @@ import numpy as np
 from vlagents_ray.contract import Contract
 from vlagents_ray.envs.base import BatchEnv, Options, Steps, episodes_of, one_row
 from vlagents_ray.envs.graphics import Renderer
-from vlagents_ray.envs.maniskill.simulator import INSTRUCTIONS, Simulator, registered_limit, step_limit
+from vlagents_ray.envs.maniskill.simulator import INSTRUCTIONS, Simulator, step_limits
 from vlagents_ray.envs.render_probe import render_probe, without
 from vlagents_ray.envs.simulator import SimulatorEnv, require_sizes
 from vlagents_ray.errors import ConfigError, NotReset
@@ -82,9 +82,8 @@ class ManiSkill(SimulatorEnv):
             reconfigure: Rebuild the scene for each episode. Without it the dynamics of some tasks
                 (PlugCharger, PushT) depend on the previous episode; it saves about 15 ms per reset.
         """
-        super().__init__(f"maniskill/{task}")
-        self._own_limit = registered_limit(task)
-        self.max_steps = step_limit(self._name, max_steps, self._own_limit)
+        super().__init__(task)
+        self.max_steps, self._own_limit = step_limits(self._name, task, max_steps)
         self._given_instruction = instruction
         self._reconfigure = reconfigure
         self._env = _simulator(
@@ -120,7 +119,6 @@ class ManiSkill(SimulatorEnv):
 
     @classmethod
     def missing(cls) -> str | None:
-        """Return why ManiSkill cannot run here; the first call in a process renders one frame in a child process."""
         if missing := without(("mani_skill", "sapien", "gymnasium", "torch"), "pip install 'vlagents-ray[maniskill]'"):
             return missing
         probe = render_probe()
@@ -173,9 +171,8 @@ class ManiSkillBatch(BatchEnv):
             raise ConfigError(
                 f"maniskill/{task}: {sim_backend} simulates one environment, not {num_envs}; want physx_cuda"
             )
-        self._own_limit = registered_limit(task)
         self.num_envs = num_envs
-        self.max_steps = step_limit(f"maniskill/{task}", max_steps, self._own_limit)
+        self.max_steps, self._own_limit = step_limits(f"maniskill/{task}", task, max_steps)
         self._task = task
         self._instruction = instruction
         self._reconfigure = reconfigure

@@ -53,8 +53,11 @@ def instruction_for(task: str) -> str:
     return " ".join(words).lower()
 
 
-def registered_limit(task: str) -> int | None:
-    """Return the step limit that ManiSkill registers for `task`; imports ManiSkill and prepares the process for it."""
+def step_limits(env: str, task: str, wanted: int | None) -> tuple[int, int | None]:
+    """Return the step limit, `wanted` or else the task's own, and the latter; prepares the process for ManiSkill.
+
+    Raises `UnknownEnv` for an unknown task, and `ConfigError`, which names `env`, if there is no limit of 1 or more.
+    """
     prepare_rendering()
     require("sapien")
     require("mani_skill.envs")
@@ -62,17 +65,12 @@ def registered_limit(task: str) -> int | None:
     registered = require("mani_skill.utils.registration").REGISTERED_ENVS
     if task not in registered:
         raise UnknownEnv(f"maniskill has no task {task!r}: want one of {sorted(INSTRUCTIONS)}, or another of its ids")
-    limit: int | None = registered[task].max_episode_steps
-    return limit
-
-
-def step_limit(env: str, wanted: int | None, own: int | None) -> int:
-    """Return `wanted`, or else `own`, the task's limit; raises `ConfigError` if both are None."""
+    own: int | None = registered[task].max_episode_steps
     limit = own if wanted is None else wanted
     if limit is None:
         raise ConfigError(f"{env} has no step limit of its own; set max_steps")
     require_sizes(env, max_steps=limit)
-    return limit
+    return limit, own
 
 
 def chosen_backend(wanted: str) -> str:

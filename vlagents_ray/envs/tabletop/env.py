@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from typing import Any, get_args
 
 import numpy as np
 
-from vlagents_ray.contract import ActionSpec, CameraSpec, Contract, StateSpec
-from vlagents_ray.envs.base import EvalEnv, one_row, require_cameras, require_known
+from vlagents_ray.contract import CameraSpec, Contract, StateSpec
+from vlagents_ray.envs.base import DELTA_POSE, EvalEnv, one_row, require_cameras, require_known
 from vlagents_ray.envs.tabletop.render import ELEVATION, VIEW, TabletopRenderer, WristRenderer
 from vlagents_ray.envs.tabletop.world import PUCKS, STEP_LIMIT, Goal, TabletopWorld, Task, draw_episode, goals
 from vlagents_ray.errors import ConfigError, NotReset
@@ -72,6 +73,7 @@ class Tabletop(EvalEnv):
         """
         self.require_task(task)
         self._task = task or MIXED
+        self._tasks = [one for one in _TASKS if self._task in (MIXED, one)]
         fewest = 2 if self._task in (MIXED, "stack") else 1
         ranges: dict[str, tuple[float, int, int | None]] = {
             "width": (width, 32, None),
@@ -115,16 +117,8 @@ class Tabletop(EvalEnv):
             state={"xyzrpy": StateSpec(6, "m+rad")} | (objects if arguments.get("object_state") else {}),
             gripper=True,
             instruction=True,
-            action=ActionSpec(
-                dim=4,
-                space="ee_position",
-                delta=True,
-                rotation="none",
-                frame="base",
-                gripper_open=1.0,
-                gripper_closed=-1.0,
-                low=-1.0,
-                high=1.0,
+            action=replace(
+                DELTA_POSE, dim=4, space="ee_position", rotation="none", gripper_open=1.0, gripper_closed=-1.0
             ),
             control_hz=_CONTROL_HZ,
         )
@@ -158,7 +152,7 @@ class Tabletop(EvalEnv):
         if unknown:
             raise ConfigError(f"tabletop: unknown reset options {unknown}, want none or 'instruction'")
         rng = np.random.default_rng(seed % 2**64)  # numpy accepts no negative seed
-        task = _TASKS[rng.integers(len(_TASKS))] if self._task == MIXED else self._task_in_scene()
+        task = self._tasks[rng.integers(len(_TASKS)) if self._task == MIXED else 0]
         world, goal = draw_episode(task, rng, self._pucks)
         if options:
             goal = self._chosen(world, options["instruction"])
@@ -179,13 +173,8 @@ class Tabletop(EvalEnv):
         world.step(dx * STEP_LIMIT, dy * STEP_LIMIT, dz * STEP_LIMIT, (grip + 1) / 2)
         self._steps += 1
         success = goal.reached(world)
-        return (
-            self._observe(world, goal, look=self.looked_at),
-            float(success),
-            False,
-            self._steps >= self.max_steps,
-            {"success": success},
-        )
+        obs = self._observe(world, goal, look=self.looked_at)
+        return obs, float(success), False, self._steps >= self.max_steps, {"success": success}
 
     def close(self) -> None:
         self._world = self._goal = None
@@ -199,12 +188,8 @@ class Tabletop(EvalEnv):
         cameras = {name: renderer.draw(world) for name, renderer in self._renderers.items()} if look else {}
         return Obs(cameras=cameras, gripper=world.opening, state=state)
 
-    def _task_in_scene(self) -> Task:
-        return next(task for task in _TASKS if task == self._task)
-
     def _chosen(self, world: TabletopWorld, instruction: object) -> Goal:
-        tasks = _TASKS if self._task == MIXED else (self._task_in_scene(),)
-        possible = {goal.instruction: goal for task in tasks for goal in goals(world, task)}
+        possible = {goal.instruction: goal for task in self._tasks for goal in goals(world, task)}
         if instruction not in possible:
             raise ConfigError(f"tabletop: got instruction {instruction!r}, want one of this scene's: {list(possible)}")
         return possible[str(instruction)]

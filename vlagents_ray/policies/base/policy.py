@@ -28,15 +28,19 @@ from vlagents_ray.policies.base.checkpoint_files import weights_of
 from vlagents_ray.policies.base.config import ModelConfig
 from vlagents_ray.policies.base.model_inputs import (
     Row,
+    camera_specs,
     count_in,
     drawn,
     leftover_plan,
+    needs_gripper,
     shared_frames,
+    state_specs,
     wanted_behaviour,
     wanted_samples,
 )
 from vlagents_ray.policies.compilation import Compilation, quantize, require_whole
 from vlagents_ray.policies.loading import COMPILED_SIZES, LoadingReport, current_report, report_progress
+from vlagents_ray.policies.outcomes import attempt
 from vlagents_ray.validation import check_action
 
 logger = logging.getLogger(__name__)
@@ -121,6 +125,25 @@ class ModelPolicy(Agent, abc.ABC):
     def chunk(self, horizon: int) -> int:
         """Return, for the contract, how many of the model's `horizon` rows an `act` returns."""
         return min(self.config.execute or horizon, horizon) if self.config.actions == "chunk" else 1
+
+    def stated(self, cameras: Mapping[str, str], parts: Sequence[str], horizon: int | None, **facts: Any) -> Contract:
+        """Return the contract of a model.
+
+        Args:
+            cameras: Its names of the cameras -> ours.
+            parts: The parts of its state vector, in order.
+            horizon: The rows of its chunks; None before they are known.
+            facts: Further fields of the contract, or other values of these.
+        """
+        usual: dict[str, Any] = {
+            "cameras": camera_specs(cameras),
+            "state": state_specs(parts, self.state_dim),
+            "gripper": needs_gripper(parts),
+            "instruction": True,
+            "chunk": None if horizon is None else self.chunk(horizon),
+            "history": self.history,
+        }
+        return Contract(**usual | facts)
 
     @abc.abstractmethod
     def load(self) -> Any:
@@ -212,23 +235,12 @@ class ModelPolicy(Agent, abc.ABC):
 
     def act_batch(self, obs: Sequence[Obs], sessions: Sequence[Agent]) -> list[Act | Exception]:
         """Return a chunk (H, D), or one action (D,), for each session, from one forward pass for all that need one."""
-        results: list[Act | Exception | None] = [None] * len(obs)
-        rows: list[Row] = []
-        owners: list[int] = []
-        for i, (one, session) in enumerate(zip(obs, sessions, strict=True)):
-            try:
-                wanted = self._rows(one, session)  # type: ignore[arg-type]
-            except Exception as error:  # noqa: BLE001 - handed to the session whose request failed
-                results[i] = error
-                continue
-            rows += wanted
-            owners += [i] * len(wanted)
-        predictions: list[list[Prediction | Exception]] = [[] for _ in obs]
-        for i, prediction in zip(owners, self._forward(rows), strict=True):
-            predictions[i].append(prediction)
+        wanted = [attempt(self._rows, one, session) for one, session in zip(obs, sessions, strict=True)]
+        rows = [row for own in wanted if not isinstance(own, Exception) for row in own]
+        found = iter(self._forward(rows))
         return [
-            done if done is not None else self._act(session, found)  # type: ignore[arg-type]
-            for done, session, found in zip(results, sessions, predictions, strict=True)
+            own if isinstance(own, Exception) else self._act(session, list(itertools.islice(found, len(own))))  # type: ignore[arg-type]
+            for own, session in zip(wanted, sessions, strict=True)
         ]
 
     def sleep(self) -> None:

@@ -12,27 +12,35 @@ _OPEN, _CLOSED = 1.0, -1.0
 _CURE = "this expert is for the env's own robot, in the control mode pd_ee_delta_pose"
 
 
-class PushCube:
+class _CubeExpert:
+    """Moves the tool in phases, of which "over" is the first."""
+
+    _SIZE: int  # of the simulator's state
+
+    def __init__(self, env_name: str) -> None:
+        self._name, self._phase, self._closing, self._hand = env_name, "over", 0, _Hand()
+
+    def reset(self, obs: Obs, instruction: str) -> None:
+        self._state(obs)
+        self._phase, self._closing, self._hand = "over", 0, _Hand()
+
+    def _state(self, obs: Obs) -> np.ndarray:
+        return sim_vector(obs, self._SIZE, self._name, _CURE).astype(np.float64)
+
+
+class PushCube(_CubeExpert):
     """Moves around and behind the cube, down to the table, and pushes it along x onto the target."""
 
+    _SIZE = 35
     _BEHIND_M = 0.12  # distance of the tool behind the cube before the push
     _OVER_M = 0.15  # height of the tool on the way there, clear of the cube
     _LOW_M = 0.02  # height of the tool while pushing: the cube's middle
     _FAR_M = 0.28  # distance of the target from the centre of the table, along x
     _PLACED_M = 0.03  # distance of the cube from the target's centre; success needs 0.1
 
-    def __init__(self, env_name: str) -> None:
-        self._name = env_name
-        self._phase = "over"
-        self._hand = _Hand()
-
-    def reset(self, obs: Obs, instruction: str) -> None:
-        sim_vector(obs, 35, self._name, _CURE)
-        self._phase, self._hand = "over", _Hand()
-
     def act(self, obs: Obs) -> Act:
         # qpos 9, qvel 9, tool pose 7, goal 3, cube pose 7
-        state = sim_vector(obs, 35, self._name, _CURE).astype(np.float64)
+        state = self._state(obs)
         tool, goal, cube = state[18:21], state[25:28], state[28:31]
         over = np.array([cube[0] - self._BEHIND_M, cube[1], self._OVER_M])
         low = np.array([cube[0] - self._BEHIND_M, cube[1], self._LOW_M])
@@ -53,26 +61,17 @@ class PushCube:
         return self._hand.move(tool, tool, _CLOSED)
 
 
-class PickCube:
+class PickCube(_CubeExpert):
     """Moves over the cube and down, grasps it, moves it to the goal and holds it there."""
 
+    _SIZE = 42
     _OVER_M = 0.08  # height of the tool over the cube before it descends
     _GRASP_STEPS = 3  # until the fingers hold the cube
     _GIVE_UP_STEPS = 8  # without contact on both fingers; then it tries again from above
 
-    def __init__(self, env_name: str) -> None:
-        self._name = env_name
-        self._phase = "over"
-        self._hand = _Hand()
-        self._closing = 0
-
-    def reset(self, obs: Obs, instruction: str) -> None:
-        sim_vector(obs, 42, self._name, _CURE)
-        self._phase, self._closing, self._hand = "over", 0, _Hand()
-
     def act(self, obs: Obs) -> Act:
         # qpos 9, qvel 9, grasped 1, tool pose 7, goal 3, cube pose 7, tool to cube 3, cube to goal 3
-        state = sim_vector(obs, 42, self._name, _CURE).astype(np.float64)
+        state = self._state(obs)
         grasped, tool, goal, cube = state[18] > 0.5, state[19:22], state[26:29], state[29:32]
         if self._phase == "over" and np.linalg.norm(tool[:2] - cube[:2]) < 0.01:
             self._phase = "down"

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import inspect
 from collections.abc import Mapping, Sequence
+from contextlib import AbstractContextManager
 from typing import Any
 
 import numpy as np
@@ -93,6 +94,13 @@ class Kind:
         return self.policy.predict_action_chunk(batch)
 
 
+def row_draws(rows: Sequence[Row], *models: Any) -> AbstractContextManager[object]:
+    """Return the context in which models draw each row's numbers from that row's generator."""
+    from vlagents_ray.policies.sampling_rng import RowDraws  # imports torch
+
+    return RowDraws([row.rng for row in rows], *models)
+
+
 def vectors(config: Any) -> list[str]:
     """Return the observation keys of the vectors that a policy reads."""
     features = {FRAMES[0]: config.robot_state_feature, FRAMES[1]: config.env_state_feature}
@@ -118,11 +126,9 @@ class Diffusion(Kind):
     def __init__(self, policy: Any, compilation: Compilation) -> None:
         super().__init__(policy, compilation)
         unet = policy.diffusion.unet
-        self._denoise, self._encode = (
-            compilation.core("denoise", unet.forward),
-            compilation.core("vision encoder", self._condition),
-        )
-        unet.forward = self._forward
+        denoise = compilation.core("denoise", unet.forward)
+        self._encode = compilation.core("vision encoder", self._condition)
+        unet.forward = lambda sample, times, global_cond: denoise(sample, times, global_cond)  # noqa: PLW0108 - named
 
     @property
     def horizon(self) -> int:
@@ -141,9 +147,6 @@ class Diffusion(Kind):
         )
         return actions[:, self.steps - 1 :]
 
-    def _forward(self, sample: Any, times: Any, global_cond: Any) -> Any:
-        return self._denoise(sample, times, global_cond)
-
     def _condition(self, *inputs: Any) -> Any:
         names = [*vectors(self.config), *([IMAGES] if self.config.image_features else [])]
         return self.policy.diffusion._prepare_global_conditioning(dict(zip(names, inputs, strict=True)))
@@ -159,14 +162,12 @@ class MultiTaskDit(Kind):
         return int(self.config.horizon - self.steps + 1)
 
     def draw(self, batch: dict[str, Any], rows: Sequence[Row], leftovers: Sequence[Any]) -> Any:
-        from vlagents_ray.policies.sampling_rng import RowDraws
-
         seen = stacked(batch, self.config, len(rows))
         for name in _TOKENS:
             seen[name] = batch[name].unflatten(0, (len(rows), -1))[:, -1]  # the same in each step of a history
         condition = self.policy.observation_encoder.encode(seen)
         own = self.policy.objective, require("diffusers.utils.torch_utils")  # DDPM's steps draw in the latter
-        with RowDraws([row.rng for row in rows], *own):
+        with row_draws(rows, *own):
             actions = self.policy.objective.conditional_sample(self.policy.noise_predictor, len(rows), condition)
         return actions[:, self.steps - 1 :]
 
@@ -247,30 +248,23 @@ class Guidance:
             convert: Makes a tensor of an array, on the policy's device.
         """
         torch = require("torch")
+        settings = self._processor.rtc_config
         target, weights = torch.zeros(len(plans), *shape), torch.zeros(len(plans), shape[0], 1)
         for i, (plan, delay) in enumerate(zip(plans, delays, strict=True)):
             if plan is not None:
                 part = plan[: shape[0]]
                 target[i, : len(part), : part.shape[1]] = part
-                weights[i, :, 0] = self._weights(delay, len(part), shape[0])
+                horizon = min(settings.execution_horizon, len(part))
+                weights[i, :, 0] = self._processor.get_prefix_weights(max(delay, 0), horizon, shape[0])
         target, weights = convert(target.numpy()), convert(weights.numpy())
+        most = float(settings.max_guidance_weight)
 
         def change(velocity: Any, actions: Any, time: float) -> Any:
-            end = actions - time * velocity
-            return velocity - self._strength(time) * weights * (target - end)
+            end, done = actions - time * velocity, 1 - time
+            strength = most if done == 0 else min(most, time / done * (time**2 + done**2) / time**2)
+            return velocity - strength * weights * (target - end)
 
         return change
-
-    def _weights(self, delay: int, leftover: int, chunk: int) -> Any:
-        """Return the weight of the leftover in each row of a chunk, (chunk,) float32 in [0, 1]."""
-        horizon = min(self._processor.rtc_config.execution_horizon, leftover)
-        return self._processor.get_prefix_weights(max(delay, 0), horizon, chunk)
-
-    def _strength(self, time: float) -> float:
-        """Return the guidance strength g for LeRobot's time, which runs from 1 (noise) to 0."""
-        most = float(self._processor.rtc_config.max_guidance_weight)
-        done = 1 - time
-        return most if done == 0 else min(most, time / done * (time**2 + done**2) / time**2)
 
 
 class SmolVLAPasses(FlowPasses):
@@ -359,25 +353,20 @@ class Groot(Kind):
 
     @property
     def horizon(self) -> int:
-        return int(self.policy._resolve_prediction_horizon(require("torch").empty(1, self._longest, 1)))
+        longest = int(self.policy._groot_model.config.action_horizon)
+        return int(self.policy._resolve_prediction_horizon(require("torch").empty(1, longest, 1)))
 
     @property
     def usual(self) -> int:
         return min(int(self.policy._action_queue_steps), self.horizon)
 
-    @property
-    def _longest(self) -> int:
-        return int(self.policy._groot_model.config.action_horizon)
-
     def draw(self, batch: dict[str, Any], rows: Sequence[Row], leftovers: Sequence[Any]) -> Any:
-        from vlagents_ray.policies.sampling_rng import RowDraws
-
         groups: dict[int, list[int]] = {}
         for place, length in enumerate(batch["attention_mask"].sum(1).tolist()):
             groups.setdefault(int(length), []).append(place)
         chunks: list[Any] = [None] * len(rows)
         for length, places in groups.items():
-            with RowDraws([rows[place].rng for place in places], self.policy._groot_model.action_head):
+            with row_draws([rows[place] for place in places], self.policy._groot_model.action_head):
                 drawn = self.policy.predict_action_chunk(_part(batch, places, length, len(rows)))
             for place, chunk in zip(places, drawn, strict=True):
                 chunks[place] = chunk
@@ -490,8 +479,6 @@ class XVla(Kind):
         self._look = policy.model.forward_vlm
 
     def draw(self, batch: dict[str, Any], rows: Sequence[Row], leftovers: Sequence[Any]) -> Any:
-        from vlagents_ray.policies.sampling_rng import RowDraws
-
         firsts, owners = shared_frames(rows)
 
         def look(*inputs: Any) -> dict[str, Any]:
@@ -499,7 +486,7 @@ class XVla(Kind):
             return {name: one[owners] for name, one in self._look(*(each[firsts] for each in inputs)).items()}
 
         self.policy.model.forward_vlm = look
-        with RowDraws([row.rng for row in rows], self.policy.model):
+        with row_draws(rows, self.policy.model):
             return self.policy.predict_action_chunk(batch)
 
 
@@ -518,9 +505,7 @@ class VqBet(Kind):
         return int(self.config.action_chunk_size)
 
     def draw(self, batch: dict[str, Any], rows: Sequence[Row], leftovers: Sequence[Any]) -> Any:
-        from vlagents_ray.policies.sampling_rng import RowDraws
-
-        with RowDraws([row.rng for row in rows], self.policy.vqbet):
+        with row_draws(rows, self.policy.vqbet):
             return self.policy.vqbet(stacked(batch, self.config, len(rows)), rollout=True)
 
 

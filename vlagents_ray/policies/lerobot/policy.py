@@ -10,7 +10,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from vlagents_ray.contract import ActionSpec, CameraSpec, Contract, StateSpec
+from vlagents_ray.contract import ActionSpec, CameraSpec, Contract
 from vlagents_ray.dataset_contract import DatasetContract, angles_in, centre_between, usual_unit
 from vlagents_ray.errors import ConfigError
 from vlagents_ray.interface import Obs
@@ -37,6 +37,7 @@ from vlagents_ray.policies.lerobot.kinds import (
     Kind,
 )
 from vlagents_ray.policies.lerobot.processors import STATE, Processors, own_processors
+from vlagents_ray.policies.outcomes import attempt
 from vlagents_ray.registry import require
 
 log = logging.getLogger(__name__)
@@ -135,11 +136,14 @@ class LeRobot(ModelPolicy):
         processors.require_statistics(settings, inputs)
         environment = list(trained.environment or [ENVIRONMENT_STATE]) if settings.env_state_feature else []
         width = processors.width(kind.dim)
-        action = trained.contract.action
+        action, known = trained.contract.action, trained.contract.state or {}
+        state = state_specs(parts, settings.robot_state_feature.shape[0]) if parts else {}
+        if tuple(parts) == trained.state:
+            state |= known
+        around = state_specs(environment, settings.env_state_feature.shape[0]) if environment else {}
         contract = Contract(
             cameras={ours: _camera(settings, key) for key, ours in cameras.items()},
-            state=_states(parts, settings.robot_state_feature, trained)
-            | _environment_states(environment, settings.env_state_feature, trained),
+            state=state | {part: known.get(part, spec) for part, spec in around.items()},
             gripper=needs_gripper(parts),
             instruction=processors.instructed or None,
             action=action if action.dim == width else ActionSpec(dim=width),
@@ -182,25 +186,15 @@ class LeRobot(ModelPolicy):
         return model.kind.staging.stage(frame)
 
     def predict(self, rows: Sequence[Row]) -> list[Prediction | Exception]:
-        predictions: dict[int, Prediction | Exception] = {}
-        for members in self._groups(rows):
-            drawn: list[Prediction | Exception] = []
-            try:
-                drawn += self._draw([rows[i] for i in members])
-            except Exception as error:
-                if self.model.kind.batched:
-                    raise
-                drawn.append(error)  # fails only that session
-            predictions |= zip(members, drawn, strict=True)
-        return [predictions[i] for i in range(len(rows))]
-
-    def _groups(self, rows: Sequence[Row]) -> list[list[int]]:
-        if not self.model.kind.batched:
-            return [[i] for i in range(len(rows))]
+        if not self.model.kind.batched:  # an error fails only its session
+            return [attempt(lambda row: self._draw([row])[0], row) for row in rows]
         groups: dict[Any, list[int]] = {}
         for i, row in enumerate(rows):
             groups.setdefault(tuple(array.shape for array in row.frames[-1].values()), []).append(i)
-        return list(groups.values())
+        drawn: dict[int, Prediction | Exception] = {}
+        for members in groups.values():
+            drawn |= zip(members, self._draw([rows[i] for i in members]), strict=True)
+        return [drawn[i] for i in range(len(rows))]
 
     def _draw(self, rows: list[Row]) -> list[Prediction]:
         torch, model = require("torch"), self.model
@@ -272,10 +266,13 @@ def _of_features(features: Iterable[str], processors: Processors) -> DatasetCont
     whole = processors.statistics(STATE)
     parts = {part: processors.statistics(key) for part, key in keys.items()}
     listed = [part for key in features for part, own in keys.items() if own == key]
+
+    def alike(name: str) -> bool:
+        values, wanted = np.concatenate([parts[part].get(name, []) for part in order]), whole.get(name, [])
+        return len(values) == len(wanted) and np.allclose(values, wanted, rtol=1e-5, atol=1e-6)
+
     for order in (listed, sorted(keys, key=lambda part: (part == GRIPPER, part))):
-        if order and all(
-            _alike([parts[part].get(name, []) for part in order], whole.get(name, [])) for name in _MATCHED
-        ):
+        if order and all(map(alike, _MATCHED)):
             break
     else:
         return DatasetContract(Contract())
@@ -288,11 +285,6 @@ def _of_features(features: Iterable[str], processors: Processors) -> DatasetCont
                 angles[place + i] = centre
         place += width
     return DatasetContract(Contract(), tuple(order), angles=angles)
-
-
-def _alike(parts: Sequence[Sequence[float]], whole: Sequence[float]) -> bool:
-    values = np.concatenate(parts)
-    return len(values) == len(whole) and np.allclose(values, whole, rtol=1e-5, atol=1e-6)
 
 
 def _cameras(
@@ -324,16 +316,3 @@ def _camera(settings: Any, key: str) -> CameraSpec:
         return CameraSpec()
     _, height, width = settings.input_features[key].shape
     return CameraSpec(height, width)
-
-
-def _states(parts: Sequence[str], feature: Any, trained: DatasetContract) -> dict[str, StateSpec]:
-    specs = state_specs(parts, feature.shape[0]) if parts else {}
-    if tuple(parts) == trained.state:
-        specs |= trained.contract.state or {}
-    return specs
-
-
-def _environment_states(parts: Sequence[str], feature: Any, trained: DatasetContract) -> dict[str, StateSpec]:
-    specs = state_specs(parts, feature.shape[0]) if parts else {}
-    known = trained.contract.state or {}
-    return {part: known.get(part, spec) for part, spec in specs.items()}

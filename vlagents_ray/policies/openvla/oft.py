@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
@@ -15,22 +15,14 @@ from typing_extensions import Self
 from vlagents_ray.contract import Contract
 from vlagents_ray.errors import ConfigError, InvalidObservation
 from vlagents_ray.interface import Obs
-from vlagents_ray.policies.base import Row
+from vlagents_ray.policies.base import Prediction, Row
 from vlagents_ray.policies.base.accelerator import fetch
-from vlagents_ray.policies.base.model_inputs import (
-    camera_images,
-    camera_specs,
-    choose_cameras,
-    needs_gripper,
-    state_specs,
-    state_vector,
-)
+from vlagents_ray.policies.base.model_inputs import camera_images, choose_cameras, needs_gripper, state_vector
 from vlagents_ray.policies.base.staging import StagedRow
 from vlagents_ray.policies.compilation import Compilation
 from vlagents_ray.policies.openvla.prismatic import (
     OFFERED,
     Bounds,
-    DecodedChunk,
     PreparedRow,
     Prismatic,
     PrismaticConfig,
@@ -88,16 +80,10 @@ class OpenVLAOFT(PrismaticPolicy):
 
     @property
     def contract(self) -> Contract:
-        return Contract(
-            cameras=camera_specs(self._cameras),
-            state=state_specs(self._state, self.state_dim),
-            gripper=needs_gripper(self._state) or None,
-            instruction=True,
-            action=self._action(),
-            chunk=self.chunk(self.config.horizon),
-            history=1,
-            behaviour=self.offered(OFFERED if self.config.head == "tokens" else ()),
-        )
+        gripper = needs_gripper(self._state) or None
+        behaviour = self.offered(OFFERED if self.config.head == "tokens" else ())
+        facts = {"action": self._action(), "gripper": gripper, "behaviour": behaviour}
+        return self.stated(self._cameras, self._state, self.config.horizon, **facts)
 
     @property
     def state_dim(self) -> int | None:
@@ -159,21 +145,21 @@ class OpenVLAOFT(PrismaticPolicy):
         proprio = None if state is None else base.statistics.scale(key, "proprio").normalise(state)
         return ModelInput(seen, base.tokens(row.instruction), proprio)
 
-    def _compute(self, prepared: Sequence[PreparedRow]) -> list[DecodedChunk]:
+    def _compute(self, prepared: Sequence[PreparedRow]) -> list[Prediction]:
         """Run one forward pass, or one per diffusion step. Regression gives a session's samples the same answer."""
         firsts, owners = self.observations_of([entry.row for entry in prepared])
         inputs = [prepared[i].model_input for i in firsts]
         shape = (self.model.horizon, self.model.dim)
+        if self.config.head == "tokens":
+            draws = np.stack(
+                [entry.row.rng.random(shape) if entry.row.sample else np.full(shape, np.nan) for entry in prepared]
+            )
+            return self._decoded(self.model.base.bins, prepared, *self.model.choose(inputs, owners, draws))
         if self.config.head == "l1":
-            answers = self.model.regress(inputs)
-            return [DecodedChunk(answers[owner]) for owner in owners]
-        if self.config.head == "diffusion":
-            noise = np.stack([entry.row.noise(*shape) for entry in prepared])
-            return [DecodedChunk(chunk) for chunk in self.model.denoise(inputs, owners, noise)]
-        draws = np.stack(
-            [entry.row.rng.random(shape) if entry.row.sample else np.full(shape, np.nan) for entry in prepared]
-        )
-        return self._decoded(self.model.base.bins, prepared, *self.model.choose(inputs, owners, draws))
+            chunks = self.model.regress(inputs)[owners]
+        else:
+            chunks = self.model.denoise(inputs, owners, np.stack([entry.row.noise(*shape) for entry in prepared]))
+        return [Prediction(entry.scale.restore(chunk)) for entry, chunk in zip(prepared, chunks, strict=True)]
 
 
 def _action_dim(statistics: Statistics, unnorm_key: str | None, head: Mlp | None) -> int:
@@ -326,9 +312,9 @@ def denoise(noise: Any, predict: Callable[[int, Any], Any], trained: int, steps:
     Returns:
         (B, H, D) in [-1, 1].
     """
-    kept = _kept(trained)
-    for time, before in _times(trained, steps):
-        guessed = predict(time, noise)
+    kept, stride = _kept(trained), trained // steps
+    for time in reversed(range(0, steps * stride, stride)):
+        guessed, before = predict(time, noise), time - stride
         clean = (noise - (1 - kept[time]) ** 0.5 * guessed) / kept[time] ** 0.5
         left = kept[before] if before >= 0 else 1.0
         noise = left**0.5 * clean.clamp(-1, 1) + (1 - left) ** 0.5 * guessed
@@ -341,12 +327,6 @@ def time_embedding(time: int, dim: int, device: Any) -> Any:
     half = dim // 2
     rates = torch.exp(torch.arange(half, device=device) * -math.log(10000) / (half - 1))
     return torch.cat([(time * rates).sin(), (time * rates).cos()])
-
-
-def _times(trained: int, steps: int) -> Iterator[tuple[int, int]]:
-    stride = trained // steps
-    for i in reversed(range(steps)):
-        yield i * stride, (i - 1) * stride
 
 
 def _kept(trained: int) -> list[float]:
@@ -399,7 +379,22 @@ def _exactly(found: Weights, layers: Iterable[str], what: str) -> Weights:
     return found
 
 
-class Mlp:
+class Component:
+    """A part that fine-tuning added to OpenVLA, by the names of its tensors."""
+
+    _weights: Weights
+
+    def to(self, **place: Any) -> Self:
+        self._weights = {key: tensor.to(**place) for key, tensor in self._weights.items()}
+        return self
+
+    def _linear(self, layer: str, x: Any) -> Any:
+        import torch  # the compiler follows an import statement, but not `require`
+
+        return torch.nn.functional.linear(x, self._weights[f"{layer}.weight"], self._weights[f"{layer}.bias"])
+
+
+class Mlp(Component):
     """A head: an MLP with residual blocks over the hidden states of one row's action tokens."""
 
     def __init__(self, saved: Weights, prefix: str) -> None:
@@ -410,20 +405,20 @@ class Mlp:
     def dim(self) -> int:
         return len(self._weights["fc2.bias"])
 
-    def to(self, **place: Any) -> Mlp:
-        self._weights = {key: tensor.to(**place) for key, tensor in self._weights.items()}
-        return self
-
     def __call__(self, x: Any) -> Any:
         relu = require("torch").relu
-        x = relu(_linear(self._weights, "fc1", _norm(self._weights, "layer_norm1", x)))
+        x = relu(self._linear("fc1", self._norm("layer_norm1", x)))
         for i in (0, 1):
             block = f"mlp_resnet_blocks.{i}.ffn"
-            x = x + relu(_linear(self._weights, f"{block}.1", _norm(self._weights, f"{block}.0", x)))
-        return _linear(self._weights, "fc2", _norm(self._weights, "layer_norm2", x))
+            x = x + relu(self._linear(f"{block}.1", self._norm(f"{block}.0", x)))
+        return self._linear("fc2", self._norm("layer_norm2", x))
+
+    def _norm(self, layer: str, x: Any) -> Any:
+        bias = self._weights[f"{layer}.bias"]
+        return require("torch").nn.functional.layer_norm(x, bias.shape, self._weights[f"{layer}.weight"], bias)
 
 
-class Projector:
+class Projector(Component):
     """Maps numbers to embeddings of the language model, by two layers with GELU between them."""
 
     def __init__(self, saved: Weights, what: str) -> None:
@@ -433,25 +428,20 @@ class Projector:
     def dim(self) -> int:
         return int(self._weights["fc1.weight"].shape[1])
 
-    def to(self, **place: Any) -> Projector:
-        self._weights = {key: tensor.to(**place) for key, tensor in self._weights.items()}
-        return self
-
     def __call__(self, x: Any) -> Any:
-        gelu = require("torch").nn.functional.gelu
-        return _linear(self._weights, "fc2", gelu(_linear(self._weights, "fc1", x)))
+        return self._linear("fc2", require("torch").nn.functional.gelu(self._linear("fc1", x)))
 
 
-class Film:
+class Film(Component):
     """Vision backbones whose blocks are scaled and shifted by the instruction (arXiv 1709.07871)."""
 
     def __init__(self, saved: Weights, backbone: Any) -> None:
         """Take FiLM's tensors from `saved`, and load the other tensors into the backbone."""
-        plain, self._film = {}, {}
+        plain, film = {}, {}
         for key, tensor in _merged(saved).items():
             name = key.removeprefix("vision_backbone.")
             if ".scale." in name or ".shift." in name:
-                self._film[name] = tensor
+                film[name] = tensor
             else:
                 plain[name.replace(".block.", ".")] = tensor
         try:
@@ -462,12 +452,7 @@ class Film:
         layers = [
             f"{n}.blocks.{i}.{way}" for n, v in vits.items() for i in range(len(v.blocks)) for way in ("scale", "shift")
         ]
-        _exactly(self._film, layers, "vision_backbone")
-        self._vits = vits
-
-    def to(self, **place: Any) -> Film:
-        self._film = {key: tensor.to(**place) for key, tensor in self._film.items()}
-        return self
+        self._weights, self._vits = _exactly(film, layers, "vision_backbone"), vits
 
     def __call__(self, pixels: Any, language: Any) -> Any:
         """Return patches (B, P, V) of pixels (B, C, S, S) for instructions (B, D), each the mean of its embeddings."""
@@ -482,7 +467,7 @@ class Film:
         x = vit.norm_pre(vit.patch_drop(vit._pos_embed(vit.patch_embed(pixels))))
         for i, block in enumerate(vit.blocks[:-1]):
             layer = f"{name}.blocks.{i}"
-            scale, shift = (_linear(self._film, f"{layer}.{way}", language)[:, None] for way in ("scale", "shift"))
+            scale, shift = (self._linear(f"{layer}.{way}", language)[:, None] for way in ("scale", "shift"))
             x = x + block.ls1(block.attn(block.norm1(x)))
             x = x * (1 + scale) + shift
             x = x + block.ls2(block.mlp(block.norm2(x)))
@@ -500,16 +485,3 @@ def _merged(saved: Weights) -> dict[str, Any]:
             added = up.flatten(1).float() @ down.flatten(1).float() * (min(rank, _LORA_ALPHA) / rank)
             merged[name] = (merged[name].float() + added.view_as(merged[name])).to(merged[name].dtype)
     return merged
-
-
-def _linear(weights: Weights, layer: str, x: Any) -> Any:
-    import torch
-
-    return torch.nn.functional.linear(x, weights[f"{layer}.weight"], weights[f"{layer}.bias"])
-
-
-def _norm(weights: Weights, layer: str, x: Any) -> Any:
-    import torch
-
-    bias = weights[f"{layer}.bias"]
-    return torch.nn.functional.layer_norm(x, bias.shape, weights[f"{layer}.weight"], bias)

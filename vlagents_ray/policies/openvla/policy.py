@@ -18,13 +18,12 @@ from pydantic import Field
 from vlagents_ray.contract import Contract
 from vlagents_ray.interface import Obs
 from vlagents_ray.policies.adapters import Adapters
-from vlagents_ray.policies.base import Row
-from vlagents_ray.policies.base.model_inputs import camera_images, camera_specs, choose_cameras
+from vlagents_ray.policies.base import Prediction, Row
+from vlagents_ray.policies.base.model_inputs import camera_images, choose_cameras
 from vlagents_ray.policies.base.staging import StagedRow
 from vlagents_ray.policies.compilation import Compilation
 from vlagents_ray.policies.openvla.prismatic import (
     OFFERED,
-    DecodedChunk,
     PreparedRow,
     Prismatic,
     PrismaticConfig,
@@ -63,15 +62,8 @@ class OpenVLA(PrismaticPolicy):
 
     @property
     def contract(self) -> Contract:
-        return Contract(
-            cameras=camera_specs(self._cameras),
-            state={},
-            instruction=True,
-            action=self._action(),
-            chunk=self.chunk(1),
-            history=1,
-            behaviour=self.offered(OFFERED),
-        )
+        facts = {"action": self._action(), "gripper": None, "behaviour": self.offered(OFFERED)}
+        return self.stated(self._cameras, (), 1, **facts)
 
     def load(self) -> TokenDecoder:
         base = load_prismatic(self.config)
@@ -95,7 +87,7 @@ class OpenVLA(PrismaticPolicy):
     def _model_input(self, row: Row, key: str) -> tuple[StagedRow, list[int]]:
         return row.frames[-1], self.model.base.tokens(row.instruction)
 
-    def _compute(self, prepared: Sequence[PreparedRow]) -> list[DecodedChunk]:
+    def _compute(self, prepared: Sequence[PreparedRow]) -> list[Prediction]:
         """Decode all answers: sessions greedily unless outputs are requested, samples at temperature 1."""
         firsts, owners = self.observations_of([entry.row for entry in prepared])
         draws = np.full((len(prepared), max(entry.scale.dim for entry in prepared)), np.nan)

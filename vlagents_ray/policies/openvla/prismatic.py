@@ -31,6 +31,7 @@ from vlagents_ray.policies.base.accelerator import ensure_torchvision, fetch, to
 from vlagents_ray.policies.base.checkpoint import SavedTensors, find_checkpoint, require_loaded
 from vlagents_ray.policies.base.model_inputs import keeping_tokens
 from vlagents_ray.policies.base.staging import StagedRow, Staging
+from vlagents_ray.policies.outcomes import attempt, of_good
 from vlagents_ray.registry import require
 
 Bounds = Literal["q99", "min_max"]  # of each dimension: 1st and 99th percentile, or minimum and maximum
@@ -417,24 +418,6 @@ class PreparedRow:
     model_input: Any
 
 
-@dataclass(frozen=True, slots=True)
-class DecodedChunk:
-    """A chunk (H, D) in [-1, 1], and, if the model has one, the distribution of which it is the mode."""
-
-    values: np.ndarray
-    mean: np.ndarray | None = None
-    spread: np.ndarray | None = None
-    behaviour: dict[str, Any] = field(default_factory=dict)  # requested outputs of the row
-
-    def prediction(self, scale: Scale) -> Prediction:
-        return Prediction(
-            scale.restore(self.values),
-            None if self.mean is None else scale.restore(self.mean),
-            None if self.spread is None else scale.restore_spread(self.spread),
-            self.behaviour,
-        )
-
-
 class PrismaticPolicy(ModelPolicy):
     """Computes all valid rows of a batch together, each in the units of its own dataset."""
 
@@ -451,7 +434,7 @@ class PrismaticPolicy(ModelPolicy):
         """Return the model's input for a row of the dataset `key`; an error fails only that row."""
 
     @abc.abstractmethod
-    def _compute(self, prepared: Sequence[PreparedRow]) -> list[DecodedChunk]:
+    def _compute(self, prepared: Sequence[PreparedRow]) -> list[Prediction]:
         """Compute all rows in one batch."""
 
     def reset(self, obs: Obs, instruction: str | None, **kwargs: Any) -> dict[str, Any]:
@@ -461,20 +444,11 @@ class PrismaticPolicy(ModelPolicy):
         return info
 
     def predict(self, rows: Sequence[Row]) -> list[Prediction | Exception]:
-        results: dict[int, Prediction | Exception] = {}
-        prepared: dict[int, PreparedRow] = {}
-        for i, row in enumerate(rows):
-            try:
-                key = self._key(row)
-                scale = self._statistics(row.adapter).scale(key)
-                prepared[i] = PreparedRow(row, scale, self._model_input(row, key))
-            except Exception as error:  # noqa: BLE001 - handed to the session whose request failed
-                results[i] = error
-        entries = list(prepared.values())
-        answers = self._compute(entries) if entries else []
-        for (i, entry), answer in zip(prepared.items(), answers, strict=True):
-            results[i] = answer.prediction(entry.scale)
-        return [results[i] for i in range(len(rows))]
+        def prepare(row: Row) -> PreparedRow:
+            key = self._key(row)
+            return PreparedRow(row, self._statistics(row.adapter).scale(key), self._model_input(row, key))
+
+        return of_good([attempt(prepare, row) for row in rows], self._compute)
 
     def _example(self, seed: int, instruction: str = "warm up") -> Row:
         """Return a row of any dataset; sessions may select theirs later."""
@@ -495,17 +469,19 @@ class PrismaticPolicy(ModelPolicy):
             )
         self._checkpoint.own[adapter] = own  # type: ignore[union-attr]
 
-    def _decoded(self, bins: ActionBins, prepared: Sequence[PreparedRow], tokens: Any, over: Any) -> list[DecodedChunk]:
+    def _decoded(self, bins: ActionBins, prepared: Sequence[PreparedRow], tokens: Any, over: Any) -> list[Prediction]:
         """Return the chunks of action tokens (B, H, D) that were chosen by the logits of bins (B, H, D, bins)."""
         chunks, parts = [], bins.stated(tokens, over)
         for i, entry in enumerate(prepared):
-            values, mean, spread, logprob, entropy, chosen = parts[:, i, :, : entry.scale.dim]
+            scale = entry.scale
+            values, mean, spread, logprob, entropy, chosen = parts[:, i, :, : scale.dim]
             said = {
                 "logprob": self._used(logprob),
                 "entropy": float(self._used(entropy).sum()),
                 "replay": {"tokens": chosen.astype(np.int64)},
             }
-            chunks.append(DecodedChunk(values, mean, spread, {name: said[name] for name in entry.row.want}))
+            found = scale.restore(values), scale.restore(mean), scale.restore_spread(spread)
+            chunks.append(Prediction(*found, {name: said[name] for name in entry.row.want}))
         return chunks
 
     def _statistics(self, adapter: str = "") -> Statistics:

@@ -3,25 +3,16 @@
 from __future__ import annotations
 
 import abc
-import contextlib
-import inspect
 import logging
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import Any, ClassVar
 
 import numpy as np
-from websockets.exceptions import ConnectionClosed, InvalidHandshake, InvalidStatus
-from websockets.protocol import State
-from websockets.sync.client import connect
 
-from vlagents_ray.errors import ConnectionLost, MalformedMessage, PolicyFailed, PolicyUnavailable, Unauthorized
+from vlagents_ray.errors import ConnectionLost, MalformedMessage, PolicyFailed, PolicyUnavailable
 from vlagents_ray.protocol.messages import DEFAULT_LIMITS, Limits
 from vlagents_ray.wire.outgoing import Outgoing
-
-if TYPE_CHECKING:
-    from websockets.sync.client import ClientConnection
-
 
 logger = logging.getLogger(__name__)
 
@@ -117,81 +108,3 @@ class UpstreamClient(abc.ABC):
         return MalformedMessage(
             f"upstream {self.options.url}: got {got}, want {want}; does it speak the protocol of the deployment?"
         )
-
-
-_LOG = logging.getLogger("vlagents_ray.upstream.websocket")
-_LOG.setLevel(logging.CRITICAL)  # it logs each lost connection as an error, which is also raised
-_CLOSE_S = 1
-_REFUSED = (401, 403)
-# An upstream that computes on its event loop answers no pings meanwhile. Older versions of `websockets` send none.
-_NO_PINGS: dict[str, Any] = {"ping_interval": None} if "ping_interval" in inspect.signature(connect).parameters else {}
-
-
-class WebSocketClient(UpstreamClient):
-    """A client over a WebSocket, with limits on the size of messages and on the waiting time.
-
-    A separate thread answers the upstream's pings, so that a connection stays open while no session acts.
-    """
-
-    schemes: ClassVar[tuple[str, ...]] = ("ws", "wss")
-    key_scheme: ClassVar[str] = "Bearer"  # the word before the API key in the header `Authorization`
-
-    def __init__(self, options: ClientOptions) -> None:
-        super().__init__(options)
-        self._headers = {} if options.key is None else {"Authorization": f"{self.key_scheme} {options.key}"}
-        self._connection: ClientConnection | None = None
-        self._open = contextlib.ExitStack()
-
-    @property
-    def is_open(self) -> bool:
-        return self._connection is not None and self._connection.protocol.state is State.OPEN
-
-    def open(self, timeout_s: float) -> None:
-        """Connect; raises `PolicyUnavailable` if the upstream is unreachable, `Unauthorized` if it rejects the key."""
-        url = self.options.url
-        try:
-            opening = connect(
-                url,
-                open_timeout=timeout_s,
-                close_timeout=_CLOSE_S,
-                compression=None,
-                max_size=self.options.limits.body_bytes,
-                additional_headers=self._headers,
-                logger=_LOG,
-                **_NO_PINGS,
-            )
-            self._connection = self._open.enter_context(opening)
-        except InvalidStatus as error:
-            if error.response.status_code in _REFUSED:
-                raise Unauthorized(
-                    f"upstream {url}: it refuses the API key (HTTP {error.response.status_code}); name the environment "
-                    f"variable with the right one in key_env"
-                ) from error
-            raise PolicyUnavailable(f"upstream {url}: refused with HTTP {error.response.status_code}") from error
-        except (OSError, InvalidHandshake, ConnectionClosed, TimeoutError) as error:
-            raise self.unreachable(error) from error
-
-    def send(self, message: bytes) -> None:
-        try:
-            self._opened().send(message)
-        except (ConnectionClosed, OSError) as error:
-            raise self.lost(error) from error
-
-    def recv(self, timeout_s: float | None = None) -> bytes | str:
-        """Return the next message; raises `ConnectionLost` if the connection broke or timed out."""
-        wait_s = self.options.timeout_s if timeout_s is None else timeout_s
-        try:
-            return self._opened().recv(timeout=wait_s)
-        except TimeoutError as error:
-            raise self.lost(f"no answer within {wait_s:.3g} s") from error
-        except (ConnectionClosed, OSError) as error:
-            raise self.lost(error) from error
-
-    def close(self) -> None:
-        self._connection = None
-        self._open.close()
-
-    def _opened(self) -> ClientConnection:
-        if self._connection is None:
-            raise self.closed()
-        return self._connection

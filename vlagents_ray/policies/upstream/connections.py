@@ -80,9 +80,13 @@ class Lanes:
         deadline = time.monotonic() + self._retry_s
         work: deque[_Share] = deque()
         while not work or time.monotonic() < deadline:
-            ready = self._wait_ready(deadline)
-            if not work:
-                work.extend(self._shares(len(observations), max(1, len(ready))))
+            with self._changed:
+                self._changed.wait_for(lambda: self._ready or self._closed, max(0.0, deadline - time.monotonic()))
+                ready = list(self._ready)
+            if not work:  # single rows, or as many parts as there are connections if the protocol has batches
+                rows = len(observations)
+                parts = min(rows, max(1, len(ready))) if self._clients[0].batches else rows
+                work.extend(_Share(range(rows * i // parts, rows * (i + 1) // parts)) for i in range(parts))
             if not ready:
                 break
             others = [
@@ -109,17 +113,6 @@ class Lanes:
         for thread in self._connecting:
             thread.join(2 * _CONNECT_S)
 
-    def _shares(self, rows: int, lanes: int) -> list[_Share]:
-        """Split rows into shares: single rows, or as many parts as there are lanes if the protocol has batches."""
-        parts = min(rows, lanes) if self._clients[0].batches else rows
-        return [_Share(range(rows * i // parts, rows * (i + 1) // parts)) for i in range(parts)]
-
-    def _wait_ready(self, deadline: float) -> list[UpstreamClient]:
-        """Return the open connections once there is one; an empty list after `deadline`."""
-        with self._changed:
-            self._changed.wait_for(lambda: self._ready or self._closed, max(0.0, deadline - time.monotonic()))
-            return list(self._ready)
-
     def _work(
         self,
         client: UpstreamClient,
@@ -130,7 +123,6 @@ class Lanes:
         """Send shares over one connection until none is left or it is lost; an ended connection consumes no share."""
         while True:
             if not client.is_open:
-                client.close()
                 self._lose(client, None)
                 return
             try:
@@ -145,7 +137,6 @@ class Lanes:
                     work.append(share)
                 for row in share.rows:
                     results[row] = error
-                client.close()
                 self._lose(client, error)
                 return
             except Exception as error:  # noqa: BLE001 - the result of these rows alone
@@ -156,6 +147,7 @@ class Lanes:
                 results[row] = answer
 
     def _lose(self, client: UpstreamClient, reason: VLAgentsError | None) -> None:
+        client.close()
         with self._changed:
             if reason is not None:
                 self._reason = reason

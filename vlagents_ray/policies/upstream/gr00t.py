@@ -55,9 +55,9 @@ class GR00TClient(UpstreamClient):
         except (zmq.ZMQError, VLAgentsError) as error:
             self.close()
             raise self.unreachable(error) from error
-        if (language := modalities.get("language")) is not None and language.keys:
-            self._text_key = language.keys[0]
-        return {name: {"keys": list(one.keys), "steps": list(one.steps)} for name, one in modalities.items()}
+        if (language := modalities.get("language")) is not None and language["keys"]:
+            self._text_key = language["keys"][0]
+        return modalities
 
     def ask(self, observations: Sequence[Mapping[str, Any]]) -> list[Answer]:
         flat = is_flat(observations[0])

@@ -69,7 +69,7 @@ class OpenVLAClient(UpstreamClient):
             raise self.closed()
         most = self.options.limits.body_bytes
         try:
-            self._connection.request("POST", self._path, openvla.encode_observation(observation), self._headers)
+            self._connection.request("POST", self._path, openvla.encode(observation), self._headers)
             response = self._connection.getresponse()
             body = response.read(most + 1)
         except (http.client.HTTPException, OSError) as error:

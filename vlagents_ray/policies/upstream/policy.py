@@ -17,13 +17,13 @@ from typing_extensions import Self
 from vlagents_ray.contract import Contract
 from vlagents_ray.errors import ConfigError, ContractMismatch, NotReset, VLAgentsError
 from vlagents_ray.interface import Act, Agent, Obs
+from vlagents_ray.policies.outcomes import attempt, of_good
 from vlagents_ray.policies.upstream.client import ClientOptions, UpstreamClient
 from vlagents_ray.policies.upstream.connections import Lanes, SessionConnections
 from vlagents_ray.policies.upstream.gr00t import GR00TClient
-from vlagents_ray.policies.upstream.openpi import OpenPiBatchClient, OpenPiClient, RoboArenaClient
 from vlagents_ray.policies.upstream.openvla import OpenVLAClient
-from vlagents_ray.policies.upstream.vla_eval import VlaEvalClient
 from vlagents_ray.policies.upstream.vlagents import VlagentsClient
+from vlagents_ray.policies.upstream.websocket import OpenPiBatchClient, OpenPiClient, RoboArenaClient, VlaEvalClient
 from vlagents_ray.wire.mapping import KeyMapping
 from vlagents_ray.wire.outgoing import Outgoing
 from vlagents_ray.wire.presets import read_mapping
@@ -180,22 +180,21 @@ class Upstream(Agent):
 
     def act_batch(self, obs: Sequence[Obs], sessions: Sequence[Agent]) -> list[Act | Exception]:
         """Request the actions of all sessions from the upstreams at once; an error only fails its own session."""
-        results: list[Any] = [None] * len(obs)
-        asked: list[tuple[int, dict[str, Any]]] = []
-        for i, (one, session) in enumerate(zip(obs, sessions, strict=True)):
-            try:
-                asked.append((i, self._outgoing.observation(one, session._instruction)))  # type: ignore[attr-defined]
-            except Exception as error:  # noqa: BLE001 - returned to the session whose request failed
-                results[i] = error
-        begun = time.perf_counter()
-        answers = self._ask([sessions[i] for i, _ in asked], [theirs for _, theirs in asked]) if asked else []
-        info = {UPSTREAM_MS: (time.perf_counter() - begun) * 1e3}
-        for (i, _), answer in zip(asked, answers, strict=True):
-            try:
-                results[i] = answer if isinstance(answer, Exception) else Act(self._outgoing.rows(answer), info=info)
-            except Exception as error:  # noqa: BLE001 - returned to the session whose request failed
-                results[i] = error
-        return results
+
+        def converted(one: Obs, session: Any) -> tuple[Any, dict[str, Any]]:
+            return session, self._outgoing.observation(one, session._instruction)
+
+        def ask(good: list[tuple[Any, dict[str, Any]]]) -> list[Any]:
+            begun = time.perf_counter()
+            answers = self._ask(*zip(*good, strict=True))
+            info = {UPSTREAM_MS: (time.perf_counter() - begun) * 1e3}
+
+            def act(answer: Any) -> Any:
+                return answer if isinstance(answer, Exception) else Act(self._outgoing.rows(answer), info=info)
+
+            return [attempt(act, answer) for answer in answers]
+
+        return of_good([attempt(converted, *each) for each in zip(obs, sessions, strict=True)], ask)
 
     def close(self) -> None:
         for connections in (self._lanes, self._sessions):

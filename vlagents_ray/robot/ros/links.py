@@ -15,7 +15,7 @@ import time
 from collections.abc import Callable, Mapping
 from importlib import import_module
 from socket import SHUT_RDWR, SO_SNDTIMEO, SOL_SOCKET
-from typing import Any, Protocol
+from typing import Any
 
 from websockets.exceptions import ConnectionClosed, WebSocketException
 from websockets.sync.client import ClientConnection, connect
@@ -30,28 +30,6 @@ _SILENT_S = 2.0
 # The kernel's time limit for a send, which websockets lacks: a dead link would block the control loop for minutes.
 _SEND_LIMIT = struct.pack("@ll", 0, 200_000)
 _LARGEST = 64 << 20  # bytes of a frame; a 4K image in base64 has 34 million
-
-
-class Link(Protocol):
-    """The interface of `Ros2` and `Rosbridge`."""
-
-    name: str
-
-    @property
-    def up(self) -> bool: ...
-
-    @property
-    def connections(self) -> int: ...
-
-    def subscribe(self, topic: str, kind: str, take: Callable[[Any], None]) -> None: ...
-
-    def advertise(self, topic: str, kind: str) -> None: ...
-
-    def open(self) -> None: ...
-
-    def publish(self, topic: str, message: dict[str, Any]) -> bool: ...
-
-    def close(self) -> None: ...
 
 
 class Ros2:
@@ -232,10 +210,13 @@ class Rosbridge:
                 self._reconnect()
                 continue
             try:
-                self._receive(socket.recv(_SILENT_S))
+                try:
+                    self._receive(socket.recv(_SILENT_S))
+                except TimeoutError:
+                    if not socket.ping().wait(_SILENT_S):  # its other end is gone, as after a power failure
+                        self._lose(socket)
+                        continue
                 self._ask_silent_again(socket)
-            except TimeoutError:
-                self._probe(socket)
             except (ConnectionClosed, OSError):
                 self._lose(socket)
 
@@ -250,16 +231,6 @@ class Rosbridge:
             if time.monotonic() - at > _SILENT_S:
                 socket.send(json.dumps({"op": "unsubscribe", "topic": topic}))
                 self._ask_for(topic, socket)
-
-    def _probe(self, socket: ClientConnection) -> None:
-        """Drop a connection whose other end ended without closing it, as after a power failure."""
-        try:
-            if socket.ping().wait(_SILENT_S):
-                self._ask_silent_again(socket)
-            else:
-                self._lose(socket)
-        except (ConnectionClosed, OSError):
-            self._lose(socket)
 
     def _reconnect(self) -> None:
         try:
@@ -294,6 +265,9 @@ class Rosbridge:
                 take(came.get("msg"))
         elif came.get("op") == "status":
             logger.warning("%s: %s: %s", self._url, came.get("level"), came.get("msg"))
+
+
+Link = Ros2 | Rosbridge
 
 
 def decoded(frame: str | bytes) -> dict[str, Any]:

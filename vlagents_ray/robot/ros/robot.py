@@ -6,7 +6,7 @@ import logging
 import math
 import threading
 import time
-from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -46,7 +46,7 @@ class TopicReader:
         self.value: Any = None  # None before the first message
         self.captured_at = 0.0  # s since 1970
         self.unreadable = 0  # messages
-        self._read = _read(reading)
+        self._reading = reading
         self._by_stamp = by_stamp
         self._clock = CaptureClock()
         self._seen_at = -math.inf  # s of `time.monotonic`
@@ -64,9 +64,9 @@ class TopicReader:
             came = self._came
             if came is not None and came is not self._looked_at:
                 self._looked_at = came
-                self._read_message(*came)
+                self._keep(*came)
 
-    def _read_message(self, message: Any, arrived_at: float) -> None:
+    def _keep(self, message: Any, arrived_at: float) -> None:
         try:
             value = self._read(message)
             at = (messages.stamp(message) if self._by_stamp else None) or arrived_at
@@ -80,34 +80,25 @@ class TopicReader:
         self.value, self.captured_at = value, at
         self._seen_at = self._clock(Obs(info={CAPTURED: at}))
 
+    def _read(self, message: Any) -> Any:
+        """Return the image, the part of the state or, by its first number, the gripper's opening in a message."""
+        reading = self._reading
+        if reading.type == IMAGE:
+            return messages.image(message)
+        if reading.type == COMPRESSED:
+            return messages.compressed_image(message)
+        if reading.type == JOINT_STATE:
+            part = messages.joints(message, reading.names, reading.values)
+        else:
+            part = messages.pose(message, reading.rotation) if reading.type in POSES else messages.numbers(message)
+        if reading.open is None or reading.closed is None:
+            return part
+        return min(1.0, max(0.0, (float(part[0]) - reading.closed) / (reading.open - reading.closed)))
+
     @property
     def age_s(self) -> float:
         """The age of the reading, s; infinite if its time is in the future."""
         return time.monotonic() - self._seen_at
-
-
-def _read(reading: InputTopic) -> Callable[[Any], Any]:
-    """Return the function that reads a message of a topic."""
-    if reading.type == IMAGE:
-        return messages.image
-    if reading.type == COMPRESSED:
-        return messages.compressed_image
-    if reading.open is not None and reading.closed is not None:
-        return lambda message: _opening(reading, message)
-    return lambda message: _state(reading, message)
-
-
-def _state(reading: InputTopic, message: Any) -> np.ndarray:
-    if reading.type == JOINT_STATE:
-        return messages.joints(message, reading.names, reading.values)
-    return messages.pose(message, reading.rotation) if reading.type in POSES else messages.numbers(message)
-
-
-def _opening(reading: InputTopic, message: Any) -> float:
-    """Return the opening of the gripper, 0 to 1, from the first number of a message."""
-    first = float(_state(reading, message)[0])
-    share = (first - (reading.closed or 0.0)) / ((reading.open or 0.0) - (reading.closed or 0.0))
-    return min(1.0, max(0.0, share))
 
 
 class RosRobot:
@@ -136,7 +127,7 @@ class RosRobot:
         self._lost_at = -math.inf  # s of `time.monotonic`
         self._stop_unsent = False
         for topic, kind in {reading.topic: reading.type for reading in settings.sensors}.items():
-            self._link.subscribe(topic, kind, self._taker(topic))
+            self._link.subscribe(topic, kind, partial(self._take, topic))
         for command in settings.actions:
             self._link.advertise(command.topic, command.type)
         if settings.heartbeat is not None:
@@ -265,14 +256,10 @@ class RosRobot:
     def _value(self, reading: InputTopic) -> Any:
         return self._readers[id(reading)].value
 
-    def _taker(self, topic: str) -> Callable[[Any], None]:
-        readers = [self._readers[id(one)] for one in self.settings.sensors if one.topic == topic]
-
-        def take(message: Any) -> None:
-            for reader in readers:
+    def _take(self, topic: str, message: Any) -> None:
+        for reader in self._readers.values():
+            if reader.topic == topic:
                 reader.take(message)
-
-        return take
 
     def _wait_for_messages(self) -> None:
         deadline = time.monotonic() + self.settings.ready_s

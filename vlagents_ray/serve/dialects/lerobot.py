@@ -324,14 +324,14 @@ def _joined(messages: Iterator[bytes], admission: MessageAdmission) -> bytes:
     parts: list[memoryview] = []
     size, limit = 0, admission.limits.body_bytes
     for message in messages:
-        part = lerobot.read_observation_part(message)
-        if part.state is TransferState.BEGIN and parts:
+        state, data = lerobot.read_observation_part(message)
+        if state is TransferState.BEGIN and parts:
             raise MalformedMessage("observation: begins twice")
-        size += len(part.data)
+        size += len(data)
         if size > limit:
             raise MessageTooLarge(f"observation: more than {limit} bytes; send smaller images, or raise `limits`")
-        admission.receive(len(part.data))
-        parts.append(part.data)
-        if part.state is TransferState.END:
+        admission.receive(len(data))
+        parts.append(data)
+        if state is TransferState.END:
             return b"".join(parts)
     raise MalformedMessage("observation: ended before its last part")

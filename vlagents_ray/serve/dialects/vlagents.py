@@ -136,9 +136,8 @@ class VlagentsConnection:
 
     def _reset(self, text: str | bytes) -> str:
         admission = self._admission(text)
-        episode = vlagents.read_reset(text, admission, self._segments)
-        obs = self._ours(episode.seen.obs)
-        info = self._session.reset(obs, episode.seen.instruction, **episode.kwargs)
+        seen, options = vlagents.read_reset(text, admission, self._segments)
+        info = self._session.reset(self._ours(seen.obs), seen.instruction, **options)
         admission.release()
         return json_numpy.dumps(info)
 

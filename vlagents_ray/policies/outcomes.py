@@ -1,0 +1,23 @@
+"""The results of a batch in which an error stands in the place of a row, and fails the request of its session alone."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Sequence
+from typing import Any
+
+
+def attempt(function: Callable[..., Any], *args: Any) -> Any:
+    """Return the function's result, or the exception that it raises."""
+    try:
+        return function(*args)
+    except Exception as error:  # noqa: BLE001 - returned to the session whose request failed
+        return error
+
+
+def of_good(rows: Sequence[Any], compute: Callable[[list[Any]], Iterable[Any]]) -> list[Any]:
+    """Compute the rows that are no exceptions in one call, if there are any; return their results among the others."""
+    found = list(rows)
+    good = [place for place, row in enumerate(rows) if not isinstance(row, Exception)]
+    for place, result in zip(good, compute([rows[place] for place in good]) if good else (), strict=True):
+        found[place] = result
+    return found
