@@ -16,7 +16,7 @@ from vlagents_ray import Act, Agent, Obs
 from vlagents_ray.client import minimal
 from vlagents_ray.client.minimal import Policy, PolicyError
 
-SLOW_S = 0.5
+SLOW_S = 1.5
 IMAGE = np.random.default_rng(0).integers(0, 256, (48, 64, 3), np.uint8)
 
 

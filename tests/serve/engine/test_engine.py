@@ -171,21 +171,19 @@ def test_a_batch_of_the_wrong_length_is_the_policys_fault(serving: Callable[...,
 
 
 class Held(Agent):
-    """Acts for 20 ms and until it is let go, and computes or waits meanwhile."""
+    """Acts for 20 ms and until it is let go."""
 
     shared: ClassVar = ("go",)
 
-    def __init__(self, *, computes: bool) -> None:
-        self._computes, self.go = computes, threading.Event()
+    def __init__(self) -> None:
+        self.go = threading.Event()
 
     def reset(self, obs: Obs, instruction: str | None, **kwargs: Any) -> dict[str, Any]:
         return {}
 
     def act(self, obs: Obs) -> Act:
-        end = time.perf_counter() + 0.02
-        while (left := end - time.perf_counter()) > 0 or not self.go.is_set():
-            if not self._computes:
-                self.go.wait() if left <= 0 else time.sleep(left)
+        time.sleep(0.02)
+        self.go.wait()
         return Act(np.zeros(1))
 
 
@@ -194,9 +192,10 @@ class Held(Agent):
     [("simulation", True, True), ("robot", False, True), ("robot", True, False)],
 )
 def test_replies_are_sent_beside_the_next_full_batch_unless_a_robot_would_wait(
-    serving: Callable[..., Engine], rank: Any, computes: bool, beside: bool
+    serving: Callable[..., Engine], monkeypatch: pytest.MonkeyPatch, rank: Any, computes: bool, beside: bool
 ) -> None:
-    agent = Held(computes=computes)
+    monkeypatch.setattr(time, "thread_time", time.perf_counter if computes else float)
+    agent = Held()
     engine, threads = serving(agent, max_batch_size=1), queue.SimpleQueue[str]()
     for session in "ab":
         ask(engine, session, "reset")
