@@ -3,6 +3,10 @@
 from __future__ import annotations
 
 import logging
+import math
+import os
+import select
+import socket
 import time
 from collections.abc import Sequence
 from typing import Any, Literal, Protocol
@@ -18,6 +22,8 @@ _OVER_A_NETWORK = {"auto": JPEG, "exact": LOSSLESS}  # codecs that depend on the
 
 _ANSWER_S = 2.0  # s, time limit for the first byte of the first replica
 _SILENT_S = 2.0  # s after which an unfinished attempt to connect is reported
+SPIN_S = 150e-6  # s to poll for an answer before sleeping
+FAST_S = 600e-6  # s; after an answer within this time, wake-up included, the next one is polled for
 
 
 class RequestChannel(Protocol):
@@ -83,6 +89,28 @@ def first_timeout_s(timeout_s: float) -> float:
 def left_s(deadline: float) -> float:
     """Return the time until a deadline, s of `time.monotonic`; at least 1 ms, as 0 means no limit to some calls."""
     return max(1e-3, deadline - time.monotonic())
+
+
+def wait(connection: socket.socket, event: int, deadline: float) -> None:
+    """Sleep until the socket is ready for `select.POLLIN` or `POLLOUT`; raises `TimeoutError` at the deadline."""
+    left_s = deadline - time.monotonic()
+    poller = select.poll()
+    poller.register(connection, event)
+    if left_s <= 0 or not poller.poll(math.ceil(left_s * 1e3)):
+        raise TimeoutError
+
+
+def wait_for_answer(poller: select.poll, connection: socket.socket, spin_until: float, deadline: float) -> None:
+    """Wait until the socket that `poller` polls is readable; raises `TimeoutError` at the deadline.
+
+    Until `spin_until`, s of `time.perf_counter`, poll without sleeping: waking up takes as long as everything else.
+    Other processes can still use the core.
+    """
+    while not poller.poll(0):  # a poll costs a fraction of the exception that an empty read raises
+        if time.perf_counter() < spin_until:
+            os.sched_yield()
+        else:
+            wait(connection, select.POLLIN, deadline)
 
 
 class CodecChoice:
