@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Sequence
+from operator import attrgetter
 from typing import Any, NamedTuple, cast
 
 from vlagents_ray.errors import (
@@ -42,6 +43,7 @@ CONTENT_TYPE = "application/x-vlagents-frame"
 _OPTIONAL: dict[str, Any] = {"request_id": "", "session": "", "rank": "robot", "deadline_ms": None}  # with defaults
 _WITH_OBS = ("reset", "act", "observe")
 _OF_RESET = ("instruction", "kwargs", "contract", "history")
+_of_reset = attrgetter(*_OF_RESET)
 _OF_CLOSE = ("op", "step", *_OPTIONAL)
 _REQUEST_KEYS = {"op", "obs", "instruction", "kwargs", "contract", "history", "blobs", "step", *_OPTIONAL}
 
@@ -101,7 +103,7 @@ def decode_requests(data: Buffer, budget: Budget, ops: Sequence[Op] = OPS) -> De
     limits = budget.limits
     header, blobs = unpack(data, limits, budget)
     nodes = header.get("requests", [header])
-    if not isinstance(nodes, list) or not nodes or not all(isinstance(node, dict) for node in nodes):
+    if not isinstance(nodes, list) or {*map(type, nodes)} != {dict}:
         raise MalformedMessage(f"requests: got {shown(nodes)}, want a list of requests")
     if len(nodes) > limits.requests:
         raise MessageTooLarge(f"requests: got {len(nodes)}, the limit is {limits.requests} in one frame")
@@ -156,7 +158,8 @@ def _step(node: dict[str, Any]) -> Any:
 
 def check_request(request: Request, limits: Limits) -> Request:
     """Check the types and sizes that JSON itself does not enforce, for a request of any format; return the request."""
-    if request.op in ("act", "close") and (of_reset := [name for name in _OF_RESET if getattr(request, name)]):
+    if request.op in ("act", "close") and any(_of_reset(request)):
+        of_reset = [name for name, value in zip(_OF_RESET, _of_reset(request), strict=True) if value]
         raise MalformedMessage(f"{request.op}: got {of_reset}, which a reset states for its whole episode")
     if request.obs is None and request.op in _WITH_OBS:
         raise MalformedMessage(f"{request.op}: no 'obs'; send the observation")
@@ -207,7 +210,7 @@ def encode_replies(replies: Sequence[Reply], *, arrived: float | None = None) ->
         if reply.timing:  # 4 decimals (0.1 us): all digits would take a third of the encoding time
             times = ",".join([f'"{k}":{v:.4f}' if type(v) is float else f'"{k}":{v}' for k, v in reply.timing.items()])
             nodes[i] = f'{nodes[i][:-1]},"timing":{{{times}}}}}'
-    blobs = dump([len(blob) for blob in writer.blobs])
+    blobs = f"[{','.join([str(len(blob)) for blob in writer.blobs])}]"
     head = nodes[0][1:-1] if len(nodes) == 1 else f'"replies":[{",".join(nodes)}]'
     return b"".join(assemble(f'{{{head},"blobs":{blobs}}}', writer.blobs))
 
@@ -235,7 +238,7 @@ def decode_replies(data: Buffer, limits: Limits = DEFAULT_LIMITS) -> list[Reply]
     """Decode the replies in a frame, at least one."""
     header, blobs = unpack(data, limits)
     nodes = header.get("replies", [header])
-    if not isinstance(nodes, list) or not nodes or not all(isinstance(node, dict) for node in nodes):
+    if not isinstance(nodes, list) or {*map(type, nodes)} != {dict}:
         raise MalformedMessage(f"replies: got {shown(nodes)}, want a list of replies")
     return [_read_reply(node, ValueReader(blobs, Budget(limits))) for node in nodes]
 

@@ -137,7 +137,7 @@ class CodecChoice:
     def codec_for(self, obs: Obs | None, most_bytes: float = float("inf")) -> ImageCodec:
         """Return the codec for an observation; never raw for more than `most_bytes`, unless the user chose that."""
         codec = self.codec or RAW
-        if codec == RAW and self._compressed is not None and obs is not None:
+        if self._compressed is not None and obs is not None and codec == RAW:
             size = sum(image.nbytes for image in obs.cameras.values())
             return self._compressed if size > most_bytes else RAW
         return codec

@@ -22,7 +22,7 @@ from urllib.parse import SplitResult, urlsplit
 import numpy as np
 from websockets.client import ClientProtocol
 from websockets.exceptions import ConnectionClosed, InvalidHandshake, InvalidStatus
-from websockets.frames import Frame, Opcode
+from websockets.frames import Frame, Opcode, apply_mask
 from websockets.protocol import State
 from websockets.sync.client import connect
 from websockets.uri import parse_uri
@@ -53,6 +53,7 @@ _DIRECT_S = 1.0  # s to wait for a replica's own port: a firewall may drop the p
 _READ_BYTES = 256 * 1024
 _KEPT_BYTES = 1024 * 1024  # fits a message with two or three raw images
 _HEAD_BYTES = 16  # largest header of the frame before the message, plus 2
+_LARGE_BYTES = 4096  # more are masked faster by numpy
 
 
 class ProxiedSocket:
@@ -205,21 +206,24 @@ class Stream:
         size = sum(map(len, pieces))
         memory = self._kept if size <= _KEPT_BYTES - 2 * _HEAD_BYTES else bytearray(size + 2 * _HEAD_BYTES)
         view, at = memoryview(memory), _HEAD_BYTES
-        for piece in pieces:
-            view[at : at + len(piece)] = piece
-            at += len(piece)
         mask = os.urandom(4)
-        masked = np.frombuffer(memory, np.uint32, -(-size // 4), _HEAD_BYTES)
-        masked ^= np.frombuffer(mask, np.uint32)
+        words = np.frombuffer(mask, np.uint32)
+        for piece in pieces:
+            end, shift = at + len(piece), at % 4
+            if shift == len(piece) % 4 == 0 and len(piece) > _LARGE_BYTES:  # copied and masked in one pass
+                np.bitwise_xor(np.frombuffer(piece, np.uint32), words, np.frombuffer(view[at:end], np.uint32))
+            else:
+                view[at:end] = apply_mask(piece, (2 * mask)[shift : shift + 4])
+            at = end
         head = frame_head(size, mask)
         view[_HEAD_BYTES - len(head) : _HEAD_BYTES] = head
         return view[_HEAD_BYTES - len(head) : at]
 
     def _check_open(self) -> None:
         """Raise `ConnectionClosed` or `OSError` if the connection is closed, or is being closed by the server."""
-        if self._protocol.state is State.CLOSED:
+        if (state := self._protocol.state) is State.CLOSED:
             raise self._protocol.close_exc
-        if self._protocol.state is not State.OPEN:
+        if state is not State.OPEN:
             raise ConnectionResetError(f"the server closes the connection ({self._protocol.close_rcvd})")
 
     def _read(self, parse: Callable[[memoryview], None], deadline: float) -> None:
