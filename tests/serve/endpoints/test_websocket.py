@@ -291,6 +291,15 @@ def test_the_pieces_of_a_stream_make_no_difference(mask, sizes: list[int], piece
         assert parsed_messages(stream, pieces) == sent
 
 
+def test_the_rest_of_a_frame_is_not_taken_for_a_frame() -> None:
+    protocol, received = connected()
+    message = Frame(Opcode.BINARY, b"a message that looks like a frame").serialize(mask=True)
+    received.parse(memoryview(bytes([0x82, 0x80 | len(message), 0, 0, 0, 0])))
+    assert received.size == 0  # the parser has read the head
+    received.parse(memoryview(message))
+    assert [event.data for event in protocol.events_received() if isinstance(event, Frame)] == [message]
+
+
 def test_the_end_within_a_message_is_noticed() -> None:
     protocol, received = connected()
     received.parse(Frame(Opcode.BINARY, bytes(5000)).serialize(mask=True)[:-1])
