@@ -75,9 +75,13 @@ class ReceiveBuffer(StreamReader):
         if size > 125:
             at = 4 if size == 126 else 10
             size = int.from_bytes(data[2:at], "big")
+        begin = at + 4 if masked else at
+        if len(data) != begin + size:
+            return None
         if not masked:
-            return bytes(data[at:]) if len(data) == at + size else None
-        return frames.apply_mask(data[at + 4 :], bytes(data[at : at + 4])) if len(data) == at + 4 + size else None
+            return bytes(data[begin:])
+        message: bytes = frames.apply_mask(data[begin:], bytes(data[at:begin]))  # type: ignore[attr-defined]
+        return message
 
     def feed_data(self, data: bytes | bytearray) -> None:
         """Add bytes, as the protocol's parser requires; raise `EOFError` after `feed_eof`."""

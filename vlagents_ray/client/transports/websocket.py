@@ -22,7 +22,7 @@ from urllib.parse import SplitResult, urlsplit
 import numpy as np
 from websockets.client import ClientProtocol
 from websockets.exceptions import ConnectionClosed, InvalidHandshake, InvalidStatus
-from websockets.frames import Frame, Opcode, apply_mask
+from websockets.frames import Frame, Opcode, apply_mask  # type: ignore[attr-defined]
 from websockets.protocol import State
 from websockets.sync.client import connect
 from websockets.uri import parse_uri
@@ -147,7 +147,7 @@ class Stream:
             self._flush(deadline)
             while self._protocol.state is State.CONNECTING:
                 wait(self._socket, select.POLLIN, deadline)
-                self._read(self._protocol.receive_data, deadline)
+                self._read(lambda data: self._protocol.receive_data(bytes(data)), deadline)
                 if self._protocol.handshake_exc is not None:
                     raise self._protocol.handshake_exc
             self._received.attach(self._protocol)

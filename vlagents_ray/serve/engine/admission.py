@@ -202,7 +202,8 @@ class MessageAdmission(Budget):
             self._admission.release(held)
 
     def __del__(self) -> None:
-        self.release()
+        if self._held:
+            self.release()
 
     def _refusal_of(self, admit: Callable[[object], bool], op: object) -> VLAgentsError | None:
         try:
