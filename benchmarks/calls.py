@@ -37,7 +37,7 @@ from vlagents_ray.serve.launch.server import running_server
 
 POLICY = "benchmarks.calls:CountedNoop"
 WARM_UP = 50  # acts
-_WAITING = {"_wait_for_request", "_wait_for_event", "poll", "mark_idle", "mark_busy", "wait_for_answer"}
+_WAITING = {"_wait_for_request", "_wait_for_event", "poll", "mark_idle", "mark_busy", "await_answer"}
 _WAITING_CALLS = {"clock_nanosleep", "epoll_pwait", "epoll_wait", "futex", "poll", "restart_syscall", "sched_yield"}
 _OFTEN = 0.5  # calls an act; rarer ones are of other threads
 Counts = dict[str, float]

@@ -399,9 +399,8 @@ class RemoteAgent(Agent):
 
     def _call(self, sessions: Sequence[ClientSession], requests: Sequence[Request], timeout_s: float) -> list[Reply]:
         call = partial(call_with_recovery, self._connection, sessions) if self._resume else self._connection.call
-        if self._tracer is None:
-            return call(requests, timeout_s)
-        return self._traced(requests, partial(call, requests, timeout_s))
+        send = partial(call, requests, timeout_s)
+        return send() if self._tracer is None else self._traced(requests, send)
 
     def _traced(self, requests: Sequence[Request], send: Callable[[], list[Reply]]) -> list[Reply]:
         """Send one message within a span, a child of the caller's if there is one and the parent of the server's."""

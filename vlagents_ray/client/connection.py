@@ -22,7 +22,6 @@ if TYPE_CHECKING:
 logger = logging.getLogger(__name__)
 
 _CLOSE_S = 2.0
-_OF_THE_LOOP = frozenset(OF_THE_LOOP)
 # The deadline sent to the server is shorter by the time of transport: this share of it, at most this many s.
 _TRANSPORT_SHARE, _TRANSPORT_S = 0.1, 0.2
 _LOOK_UP_S, _LOOK_UP_PAUSE_S = 10.0, 1.0  # s to find another replica, and between two attempts
@@ -158,13 +157,13 @@ class Connection:
                 self._silent = time.monotonic() - self._silent_since >= SILENT_S
                 self._must_reconnect = self._must_reconnect or (self._silent and self._leaves_silent)
             replies = [Reply(request.request_id, error=error) for request in requests]
-        noted = len(replies) != len(requests)
         for reply in replies:
-            noted = noted or reply.error is not None or reply.draining
             if reply.act is not None:  # a server must not set keys of the control loop
-                for name in _OF_THE_LOOP & reply.act.info.keys():
-                    del reply.act.info[name]
-        return self._noted(requests, replies) if noted else replies
+                for name in OF_THE_LOOP:
+                    reply.act.info.pop(name, None)
+        if len(replies) == len(requests) and not any(reply.error or reply.draining for reply in replies):
+            return replies
+        return self._noted(requests, replies)
 
     def _noted(self, requests: Sequence[Request], replies: list[Reply]) -> list[Reply]:
         """Record errors and whether to reconnect; return a reply for each request."""

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import time
 from collections.abc import Sequence
-from operator import attrgetter
 from typing import Any, NamedTuple, cast
 
 from vlagents_ray.errors import (
@@ -43,7 +42,6 @@ CONTENT_TYPE = "application/x-vlagents-frame"
 _OPTIONAL: dict[str, Any] = {"request_id": "", "session": "", "rank": "robot", "deadline_ms": None}  # with defaults
 _WITH_OBS = ("reset", "act", "observe")
 _OF_RESET = ("instruction", "kwargs", "contract", "history")
-_of_reset = attrgetter(*_OF_RESET)
 _OF_CLOSE = ("op", "step", *_OPTIONAL)
 _REQUEST_KEYS = {"op", "obs", "instruction", "kwargs", "contract", "history", "blobs", "step", *_OPTIONAL}
 
@@ -158,8 +156,7 @@ def _step(node: dict[str, Any]) -> Any:
 
 def check_request(request: Request, limits: Limits) -> Request:
     """Check the types and sizes that JSON itself does not enforce, for a request of any format; return the request."""
-    if request.op in ("act", "close") and any(_of_reset(request)):
-        of_reset = [name for name, value in zip(_OF_RESET, _of_reset(request), strict=True) if value]
+    if request.op in ("act", "close") and (of_reset := [name for name in _OF_RESET if getattr(request, name)]):
         raise MalformedMessage(f"{request.op}: got {of_reset}, which a reset states for its whole episode")
     if request.obs is None and request.op in _WITH_OBS:
         raise MalformedMessage(f"{request.op}: no 'obs'; send the observation")

@@ -6,7 +6,6 @@ import base64
 import json
 import math
 from collections.abc import Mapping, Sequence
-from functools import cache
 from typing import Any
 
 import numpy as np
@@ -29,10 +28,12 @@ class ValueWriter:
 
     def array(self, value: np.ndarray) -> dict[str, Any]:
         """Return a reference to an array, whose bytes become a blob, without a copy where possible."""
-        dtype, name = _wire_dtype(value.dtype)
+        dtype = value.dtype.newbyteorder("<")
+        if not is_plain(dtype.str):
+            raise InvalidInput(f"array: got dtype {value.dtype}, want bool, integers or floats; convert it")
         data = np.ascontiguousarray(value, dtype)
         self.blobs.append(data.data.cast("B") if data.size else b"")
-        return {"$": ["nd", len(self.blobs) - 1, name, value.shape]}
+        return {"$": ["nd", len(self.blobs) - 1, dtype.str, value.shape]}
 
     def image(self, file: bytes) -> dict[str, Any]:
         """Return a reference to an encoded image."""
@@ -62,15 +63,6 @@ class ValueWriter:
         raise InvalidInput(
             f"info: got {type(value).__name__}, want None, bool, int, float, str, bytes, array, list or dict"
         )
-
-
-@cache
-def _wire_dtype(dtype: np.dtype[Any]) -> tuple[np.dtype[Any], str]:
-    """Return the little-endian dtype, and its name; raise `InvalidInput` if it is not plain."""
-    found = dtype.newbyteorder("<")
-    if not is_plain(found.str):
-        raise InvalidInput(f"array: got dtype {dtype}, want bool, integers or floats; convert it")
-    return found, found.str
 
 
 class ValueReader:
@@ -109,12 +101,10 @@ class ValueReader:
         if isinstance(node, dict):
             if "$" in node:
                 return self.blob(node)
-            if depth >= self._limits.depth:
-                raise self._too_deep()
+            self._nest(depth)
             return {key: self.value(item, depth + 1) for key, item in node.items()}
         if isinstance(node, list):
-            if depth >= self._limits.depth:
-                raise self._too_deep()
+            self._nest(depth)
             return [self.value(item, depth + 1) for item in node]
         return node
 
@@ -124,10 +114,9 @@ class ValueReader:
             raise MalformedMessage(f"reference: got {shown(node)}, want {{'$': [kind, blob, ...]}}")
         kind, *rest = reference
         if kind == "nd" and len(rest) == 3:
-            index, dtype, shape = rest
-            data = self._get(index)
+            data = self._get(rest[0])
             self._budget.count(len(data))
-            return read_array(data, dtype, shape)
+            return read_array(data, rest[1], rest[2])
         if kind == "img" and len(rest) == 1:
             return self._image(rest[0])
         if kind == "bin" and len(rest) == 1:
@@ -157,8 +146,9 @@ class ValueReader:
             self._budget.count(len(data))
         return known
 
-    def _too_deep(self) -> MessageTooLarge:
-        return MessageTooLarge(f"info: nested deeper than {self._limits.depth}; flatten it")
+    def _nest(self, depth: int) -> None:
+        if depth >= self._limits.depth:
+            raise MessageTooLarge(f"info: nested deeper than {self._limits.depth}; flatten it")
 
     def _get(self, index: Any) -> Buffer:
         if type(index) is not int or not 0 <= index < len(self._blobs):

@@ -6,17 +6,16 @@ from collections.abc import Generator
 
 from websockets import frames
 from websockets.frames import Frame, Opcode
-from websockets.protocol import CLIENT, OPEN, Protocol
+from websockets.protocol import OPEN, SERVER, Protocol
 from websockets.streams import StreamReader
 
 _SMALL_BYTES = 1024  # parts of a frame up to this size are copied, since a view of them may outlast the buffer
 _BINARY = 0x80 | Opcode.BINARY  # first byte of a message in one frame
-_MASKED = 0x80  # bit of the second byte
 
 
 def frame_head(size: int, mask: bytes = b"") -> bytes:
     """Return the head of the frame of a binary message of `size` bytes; a client's frame has a mask of four bytes."""
-    bit = _MASKED if mask else 0
+    bit = 0x80 if mask else 0
     if size < 126:
         return bytes((_BINARY, bit | size)) + mask
     if size < 2**16:
@@ -64,24 +63,18 @@ class ReceiveBuffer(StreamReader):
 
     def _message(self, data: bytes | memoryview) -> bytes | None:
         """Return the message if `data` are one binary frame; None if they must be parsed step by step."""
-        protocol = self._protocol
-        if protocol.state is not OPEN or len(data) < 2 or data[0] != _BINARY:
+        masked = self._protocol.side is SERVER  # only a client's frames have a mask
+        if self._protocol.state is not OPEN or len(data) < 2 or data[0] != _BINARY or (data[1] > 127) is not masked:
             return None
-        at, size = 2, data[1]
-        masked = size >= _MASKED
-        if masked is (protocol.side is CLIENT):  # only a client's frames have a mask
-            return None
-        size &= ~_MASKED
+        at, size = 2, data[1] & 127
         if size > 125:
             at = 4 if size == 126 else 10
             size = int.from_bytes(data[2:at], "big")
-        begin = at + 4 if masked else at
+        begin = at + 4 * masked
         if len(data) != begin + size:
             return None
-        if not masked:
-            return bytes(data[begin:])
-        message: bytes = frames.apply_mask(data[begin:], bytes(data[at:begin]))  # type: ignore[attr-defined]
-        return message
+        mask = bytes(data[at:begin])
+        return frames.apply_mask(data[begin:], mask) if masked else bytes(data[begin:])  # type: ignore[attr-defined, no-any-return, unused-ignore]
 
     def feed_data(self, data: bytes | bytearray) -> None:
         """Add bytes, as the protocol's parser requires; raise `EOFError` after `feed_eof`."""

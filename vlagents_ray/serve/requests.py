@@ -182,9 +182,8 @@ class Message:
         """Record that the requests are decoded, with their operations and classes."""
         self._decoded = time.perf_counter()
         self._asked = [(request.op, request.rank) for request in decoded.requests]
-        if decoded.refused:
-            for place in sorted(decoded.refused):
-                self._asked.insert(place, ("unknown", "robot"))
+        for place in sorted(decoded.refused):
+            self._asked.insert(place, ("unknown", "robot"))
 
     def decoded_alike(self, requests: int = 1) -> None:
         """Record that `requests` requests, all of the message's own `op` and `rank`, are decoded."""

@@ -100,15 +100,11 @@ def wait(connection: socket.socket, event: int, deadline: float) -> None:
         raise TimeoutError
 
 
-def wait_for_answer(poller: select.poll, connection: socket.socket, spin_until: float, deadline: float) -> None:
-    """Wait until the socket that `poller` polls is readable; raises `TimeoutError` at the deadline.
-
-    Until `spin_until`, s of `time.perf_counter`, poll without sleeping: waking up takes as long as everything else.
-    Other processes can still use the core.
-    """
+def await_answer(poller: select.poll, connection: socket.socket, spin_until: float, deadline: float) -> None:
+    """Wait for `connection`, which `poller` polls, as `wait`; sleep only after `spin_until`, s of `perf_counter`."""
     while not poller.poll(0):  # a poll costs a fraction of the exception that an empty read raises
         if time.perf_counter() < spin_until:
-            os.sched_yield()
+            os.sched_yield()  # other processes can use the core; to be woken up takes as long as everything else
         else:
             wait(connection, select.POLLIN, deadline)
 

@@ -21,7 +21,7 @@ from typing import Any, ClassVar
 import numpy as np
 
 from vlagents_ray.client.credentials import ANONYMOUS, Credentials
-from vlagents_ray.client.transports.base import FAST_S, SPIN_S, wait, wait_for_answer
+from vlagents_ray.client.transports.base import FAST_S, SPIN_S, await_answer, wait
 from vlagents_ray.errors import ConnectionLost, DeadlineExceeded, PolicyUnavailable
 from vlagents_ray.images.codecs import RAW
 from vlagents_ray.protocol import shm_layout
@@ -113,7 +113,7 @@ class UnixTransport(ABC):
         begun = time.perf_counter()
         spin_until = begun + (SPIN_S if self._answers_fast else 0.0)
         while True:
-            wait_for_answer(self._poller, connection, spin_until, deadline)
+            await_answer(self._poller, connection, spin_until, deadline)
             replies = self._receive(connection)
             if replies[0].answers(requests[0]):
                 if not replies[0].request_id:  # refused before it was parsed

@@ -22,21 +22,13 @@ from urllib.parse import SplitResult, urlsplit
 import numpy as np
 from websockets.client import ClientProtocol
 from websockets.exceptions import ConnectionClosed, InvalidHandshake, InvalidStatus
-from websockets.frames import Frame, Opcode, apply_mask  # type: ignore[attr-defined]
+from websockets.frames import Frame, Opcode
 from websockets.protocol import State
 from websockets.sync.client import connect
 from websockets.uri import parse_uri
 
 from vlagents_ray.client.credentials import ANONYMOUS, WEBSOCKET_LOG, Credentials, require_plain, tls_failure
-from vlagents_ray.client.transports.base import (
-    FAST_S,
-    SPIN_S,
-    CodecChoice,
-    first_timeout_s,
-    left_s,
-    wait,
-    wait_for_answer,
-)
+from vlagents_ray.client.transports.base import FAST_S, SPIN_S, CodecChoice, await_answer, first_timeout_s, left_s, wait
 from vlagents_ray.client.transports.http import HttpTransport, http_url, refusal
 from vlagents_ray.errors import ConnectionLost, DeadlineExceeded, MessageTooLarge, NoReplica, PolicyUnavailable
 from vlagents_ray.protocol.frame_layout import Buffer
@@ -53,7 +45,6 @@ _DIRECT_S = 1.0  # s to wait for a replica's own port: a firewall may drop the p
 _READ_BYTES = 256 * 1024
 _KEPT_BYTES = 1024 * 1024  # fits a message with two or three raw images
 _HEAD_BYTES = 16  # largest header of the frame before the message, plus 2
-_LARGE_BYTES = 4096  # more are masked faster by numpy
 
 
 class ProxiedSocket:
@@ -178,7 +169,7 @@ class Stream:
         try:
             while not self._messages:
                 self._check_open()
-                wait_for_answer(self._poller, self._socket, spin_until, deadline)
+                await_answer(self._poller, self._socket, spin_until, deadline)
                 self._read(self._received.parse, deadline)
         except TimeoutError:
             self._silent = True
@@ -206,15 +197,12 @@ class Stream:
         size = sum(map(len, pieces))
         memory = self._kept if size <= _KEPT_BYTES - 2 * _HEAD_BYTES else bytearray(size + 2 * _HEAD_BYTES)
         view, at = memoryview(memory), _HEAD_BYTES
-        mask = os.urandom(4)
-        words = np.frombuffer(mask, np.uint32)
         for piece in pieces:
-            end, shift = at + len(piece), at % 4
-            if shift == len(piece) % 4 == 0 and len(piece) > _LARGE_BYTES:  # copied and masked in one pass
-                np.bitwise_xor(np.frombuffer(piece, np.uint32), words, np.frombuffer(view[at:end], np.uint32))
-            else:
-                view[at:end] = apply_mask(piece, (2 * mask)[shift : shift + 4])
-            at = end
+            view[at : at + len(piece)] = piece
+            at += len(piece)
+        mask = os.urandom(4)
+        masked = np.frombuffer(memory, np.uint32, -(-size // 4), _HEAD_BYTES)
+        masked ^= np.frombuffer(mask, np.uint32)
         head = frame_head(size, mask)
         view[_HEAD_BYTES - len(head) : _HEAD_BYTES] = head
         return view[_HEAD_BYTES - len(head) : at]
@@ -227,7 +215,6 @@ class Stream:
             raise ConnectionResetError(f"the server closes the connection ({self._protocol.close_rcvd})")
 
     def _read(self, parse: Callable[[memoryview], None], deadline: float) -> None:
-        """Read from the socket, which is readable, and parse the bytes with `parse`."""
         if count := self._socket.recv_into(self._read_memory):
             parse(self._read_memory[:count])
         else:
@@ -242,7 +229,6 @@ class Stream:
             self._send(memoryview(piece), deadline)
 
     def _send(self, data: memoryview, deadline: float) -> None:
-        """Send all bytes; raises `TimeoutError` at the deadline, s of `time.monotonic`."""
         while data:
             try:
                 data = data[self._socket.send(data) :]

@@ -202,8 +202,7 @@ class MessageAdmission(Budget):
             self._admission.release(held)
 
     def __del__(self) -> None:
-        if self._held:
-            self.release()
+        self.release()
 
     def _refusal_of(self, admit: Callable[[object], bool], op: object) -> VLAgentsError | None:
         try:
