@@ -257,10 +257,11 @@ class Players:
         return folder
 
 
-def compared(standard: Played, others: Sequence[Played]) -> list[dict[str, Any]]:
-    """Return a row for each way: its rate, its difference from the standard, and its equal episodes."""
-    pairs = [_pairs(one, standard) for one in others]
-    adjusted = holm([pair.p_value for pair in pairs])
+def compared(found: Sequence[Played]) -> list[dict[str, Any]]:
+    """Return a row for each way: its rate, its difference from the first, and its equal episodes."""
+    standard = found[0]
+    pairs = [_pairs(one, standard) for one in found]
+    adjusted = [1.0, *holm([pair.p_value for pair in pairs[1:]])]
     return [
         {
             "way": one.way.name,
@@ -274,7 +275,7 @@ def compared(standard: Played, others: Sequence[Played]) -> list[dict[str, Any]]
             "equal": sum(one.episodes[seed][1] == standard.episodes[seed][1] for seed in standard.episodes),
             "must_be_equal": one.way.equal,
         }
-        for one, pair, p in zip(others, pairs, adjusted, strict=True)
+        for one, pair, p in zip(found, pairs, adjusted, strict=True)
     ]
 
 
@@ -321,7 +322,7 @@ def main(
                 out.print(f"{way.name}: skipped: {error}", style="yellow")
             else:
                 out.print(f"{way.name}: {found[-1].solved} of {len(found[-1].episodes)}")
-        rows = compared(found[0], found)
+        rows = compared(found)
         out.print(shown(rows))
         save({"ways": rows, "skipped": skipped}, json_file)
         if broken := [row["way"] for row in rows if row["must_be_equal"] and row["equal"] < row["episodes"]]:
