@@ -46,7 +46,7 @@ from vlagents_ray.weights.safetensors import read_values, write_values
 
 STANDARD = "eager, in this process"
 APP = "reference"
-EXECUTE = 4  # rows of a chunk of 8
+CHUNK, EXECUTE = 8, 4  # rows
 TOGETHER = 16  # episodes of a batch
 QUALITIES = (30, 50, 70, 85, 95)  # of JPEG; 85 is the client's
 DELAYS = (0.0, 0.05, 0.15)  # s
@@ -121,7 +121,7 @@ def ways() -> list[Way]:
         *(Way(f"JPEG, quality {one}", transport="websocket", codec=ImageCodec("jpeg", one)) for one in QUALITIES),
         Way("after a push", transport="shm", pushed=True, equal=True),
         *(Way(f"upstream, {name}", upstream=name) for name in PROTOCOLS),
-        Way("open loop, all 8 rows", execute=8),
+        Way(f"open loop, all {CHUNK} rows", execute=CHUNK),
         Way("ensemble", {"actions": "ensemble"}, execute=1),
         *(Way(f"async, {1000 * s:.0f} ms", clock=ClockConfig(latency=s, hz=HZ)) for s in DELAYS),
         *(
@@ -189,15 +189,14 @@ class Players:
     def _behind(self, protocol: str) -> Agent:
         host, ports = self._serve()
         url, mapping = PROTOCOLS[protocol]
-        rows = 1 if protocol == "vla_eval" else EXECUTE
-        contract = {"action": {"dim": 4}, "chunk": rows}
+        contract = {"action": {"dim": 4}, "chunk": 1 if protocol == "vla_eval" else CHUNK}
         config = {"protocol": protocol, "urls": [url.format(host=host, **ports)], "contract": contract}
         return Upstream.from_config(config | {"mapping": mapping})
 
     def _config(self, way: Way) -> dict[str, Any]:
         checkpoint = self._merged() if way.merged else self._checkpoint
         adapters = {"adapters": {"own": str(self._adapter())}} if way.adapter else {}
-        return {"checkpoint": str(checkpoint), "embodiment": "tabletop", "execute": way.execute} | adapters | way.config
+        return {"checkpoint": str(checkpoint), "embodiment": "tabletop"} | adapters | way.config
 
     def _serve(self) -> tuple[str, dict[str, int]]:
         if self._server is None:
