@@ -23,7 +23,7 @@ from vlagents_ray.contract import Contract
 from vlagents_ray.errors import PolicyFailed
 from vlagents_ray.interface import Agent, Obs
 from vlagents_ray.policies.wrapper import Wrapper, build_agent
-from vlagents_ray.testing.agents import random_observation
+from vlagents_ray.testing import random_observation
 from vlagents_ray.validation import check_observation
 
 _CAMERA, _STATE, _GRIPPER = "camera", "state", "gripper"  # keys: NUMBER/camera/NAME, NUMBER/state/NAME, NUMBER/gripper

@@ -373,7 +373,7 @@ class SequentialBatch(BatchEnv):
             answer: Any = self._envs[i].step(act)
             if not isinstance(answer, tuple) or len(answer) != 5:
                 want = "(Obs, reward, terminated, truncated, info)"
-                raise EnvFailed(f"env step: got {_kind(answer)}, want {want}; see EvalEnv.step")
+                raise EnvFailed(f"env step: got {kind_of(answer)}, want {want}; see EvalEnv.step")
             seen[i], rewards[i], terminated[i], truncated[i], infos[i] = answer
         self._seen = self._stacked(seen, moving)
         return self._seen, rewards, terminated, truncated, infos
@@ -409,7 +409,7 @@ class SequentialBatch(BatchEnv):
 def _begun(env: EvalEnv, seed: int, options: Options | None) -> Obs:
     answer: Any = env.reset(seed=seed, options=options)
     if not isinstance(answer, tuple) or len(answer) != 2:
-        raise EnvFailed(f"env reset: got {_kind(answer)}, want (Obs, info); see EvalEnv.reset")
+        raise EnvFailed(f"env reset: got {kind_of(answer)}, want (Obs, info); see EvalEnv.reset")
     obs: Obs = answer[0]
     return obs
 
@@ -423,5 +423,5 @@ def episodes_of(seeds: Sequence[int], num_envs: int) -> int:
     return len(seeds)
 
 
-def _kind(answer: object) -> str:
+def kind_of(answer: object) -> str:
     return f"a tuple of {len(answer)}" if isinstance(answer, tuple) else type(answer).__name__
