@@ -56,9 +56,8 @@ class ActionSpec:
     gripper_closed: float | None = None  # the value that closes it
     low: float | None = None  # lower bound of every number
     high: float | None = None  # upper bound of every number
-    arms: tuple[str, ...] | None = (
-        None  # names of several arms in the row's order: the command of each, then its gripper
-    )
+    # Names of several arms in the row's order: the command of each, then its gripper.
+    arms: tuple[str, ...] | None = None
 
     @property
     def relative(self) -> bool | None:
@@ -131,7 +130,19 @@ def _plain(value: Any) -> Any:
 
 def differences(policy: Contract, env: Contract) -> list[str]:
     """List the differences between the contracts of a policy and an env, one sentence each with its cure."""
-    found = [*_camera_differences(policy, env), *_state_differences(policy, env)]
+    found = []
+    for name, need in (policy.cameras or {}).items() if env.cameras is not None else ():
+        if (have := (env.cameras or {}).get(name)) is None:
+            found.append(
+                f"camera {name!r}: the policy needs it, the env gives {sorted(env.cameras or ())}; "
+                f"add or rename a camera of the env"
+            )
+        elif _differ(need.height, have.height) or _differ(need.width, have.width):
+            found.append(
+                f"camera {name!r}: the policy needs {need.height}x{need.width} pixels (height x width), "
+                f"the env gives {have.height}x{have.width}; set the env's camera size"
+            )
+    found += _state_differences(policy, env)
     if policy.gripper and env.gripper is False:
         found.append("gripper: the policy needs Obs.gripper, which the env does not provide; fill it, 1 = open")
     if policy.instruction and env.instruction is False:
@@ -154,23 +165,6 @@ def _differ(a: object, b: object) -> bool:
     return a is not None and b is not None and a != b
 
 
-def _camera_differences(policy: Contract, env: Contract) -> Iterator[str]:
-    if env.cameras is None:
-        return
-    for name, need in (policy.cameras or {}).items():
-        have = env.cameras.get(name)
-        if have is None:
-            yield (
-                f"camera {name!r}: the policy needs it, the env gives {sorted(env.cameras)}; "
-                f"add or rename a camera of the env"
-            )
-        elif _differ(need.height, have.height) or _differ(need.width, have.width):
-            yield (
-                f"camera {name!r}: the policy needs {need.height}x{need.width} pixels (height x width), "
-                f"the env gives {have.height}x{have.width}; set the env's camera size"
-            )
-
-
 def _state_differences(policy: Contract, env: Contract) -> Iterator[str]:
     if env.state is None:
         return
@@ -185,12 +179,10 @@ def _state_differences(policy: Contract, env: Contract) -> Iterator[str]:
             )
             continue
         if _differ(need.dim, have.dim):
-            yield (f"state {name!r}: the policy needs {need.dim} numbers, the env gives {have.dim}; {cure or _ANOTHER}")
+            cure = cure or "is this another task's or robot's policy?"
+            yield f"state {name!r}: the policy needs {need.dim} numbers, the env gives {have.dim}; {cure}"
         if _differ(need.unit, have.unit):
             yield f"state {name!r}: the policy needs {need.unit!r}, the env gives {have.unit!r}; convert it"
-
-
-_ANOTHER = "is this another task's or robot's policy?"
 
 
 def _parts_cure(dim: int | None, env: Contract) -> str:

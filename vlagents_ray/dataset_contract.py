@@ -152,9 +152,7 @@ def state_parts(
 
 def wanted_parts(policy: Contract | None) -> list[str]:
     """Return the parts of the state that a policy's contract names, "gripper" for `Obs.gripper` last."""
-    if policy is None:
-        return []
-    return [*(policy.state or {}), *([GRIPPER] if policy.gripper else [])]
+    return [] if policy is None else [*(policy.state or {}), *([GRIPPER] if policy.gripper else [])]
 
 
 def divided_state(
