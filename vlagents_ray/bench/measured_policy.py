@@ -14,7 +14,7 @@ import numpy as np
 from typing_extensions import Self
 
 from vlagents_ray.contract import Contract
-from vlagents_ray.interface import Act, Agent, Obs
+from vlagents_ray.interface import Agent, Obs
 from vlagents_ray.protocol.messages import RankName, Reply, Request
 from vlagents_ray.serve.engine.engine import Engine
 from vlagents_ray.serve.models.agent_copies import AgentCopies
@@ -82,7 +82,13 @@ class MeasuredPolicy:
         while len(found) < count:
             episodes = [i % count for i in range(len(found), len(found) + size)]
             views = [self._view(self.engine.contract, i) for i in episodes]
-            found += [act.action for act in self._act(views, self._sessions(episodes))]
+            sessions = [self._copies.make() for _ in episodes]
+            for session, view, i in zip(sessions, views, episodes, strict=True):
+                session.reset(view, INSTRUCTION, seed=i)
+            for act in self.agent.act_batch(views, sessions):
+                if isinstance(act, Exception):
+                    raise act
+                found.append(act.action)
         return found
 
     def queued(self, size: int, seconds: float, rank: RankName) -> QueuedTurn:
@@ -125,20 +131,6 @@ class MeasuredPolicy:
         # Each call counts its batch once for each of the batch's members: the harmonic mean is the batches' own.
         mean_batch = len(calls) / sum(1 / call[2] for call in calls)
         return QueuedTurn(rate_of([calls]), mean_batch, [call[1] * 1e3 for call in calls])
-
-    def _sessions(self, episodes: Sequence[int]) -> list[Agent]:
-        sessions = [self._copies.make() for _ in episodes]
-        for session, i in zip(sessions, episodes, strict=True):
-            session.reset(self._view(self.engine.contract, i), INSTRUCTION, seed=i)
-        return sessions
-
-    def _act(self, views: Sequence[Obs], sessions: Sequence[Agent]) -> list[Act]:
-        acts = []
-        for act in self.agent.act_batch(views, sessions):
-            if isinstance(act, Exception):
-                raise act
-            acts.append(act)
-        return acts
 
 
 def rate_of(calls: Sequence[Sequence[tuple[float, ...]]]) -> float:

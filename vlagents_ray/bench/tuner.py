@@ -215,7 +215,22 @@ class Tuner:
             most = max(rates, key=rates.__getitem__) if self._plan.goal.kind == "throughput" else max(rates)
             variants = self._variants(ready, sorted(size for size in rates if size <= most))
             for number, variant in enumerate(variants):
-                self._try(variant, frames, parts=len(variants) - number)
+                if any(failed.changes.items() <= variant.changes.items() for failed in self._failed):
+                    continue
+                if time.monotonic() >= self._end:
+                    self.left_out.append(f"{variant.name}: no time was left")
+                    continue
+                sizes = self._plan.args.batch.sizes or variant.changes.get("batch_sizes") or self._candidates()
+                try:
+                    with self._loaded(variant, frames) as (process, ready):
+                        for what in ready["uncompiled"]:
+                            self.left_out.append(f"{variant.name}: not compiled: {what}")
+                        if variant.changes.get("compile") and len(ready["uncompiled"]) == len(sizes):
+                            raise VariantFailed("no size could be compiled")
+                        self._sweep(process, variant, sizes, parts=len(variants) - number)
+                except VariantFailed as error:
+                    self._failed.append(variant)
+                    self.left_out.append(f"{variant.name}: {error}")
         return [size.point() for size in self._sizes]
 
     def _measure_own(self, frames: Path | None) -> Mapping[str, Any]:
@@ -256,25 +271,6 @@ class Tuner:
         compiled = [{"compile": mode} | ({"batch_sizes": list(sizes)} if mode and free else {}) for mode in modes]
         both = [one | other for other in compiled for one in dtypes]
         return [Variant(changes) for changes in [*dtypes, *compiled, *both]]
-
-    def _try(self, variant: Variant, frames: Path | None, parts: int) -> None:
-        """Measure a variant, or report its failure."""
-        if any(failed.changes.items() <= variant.changes.items() for failed in self._failed):
-            return
-        if time.monotonic() >= self._end:
-            self.left_out.append(f"{variant.name}: no time was left")
-            return
-        sizes = self._plan.args.batch.sizes or variant.changes.get("batch_sizes") or self._candidates()
-        try:
-            with self._loaded(variant, frames) as (process, ready):
-                for what in ready["uncompiled"]:
-                    self.left_out.append(f"{variant.name}: not compiled: {what}")
-                if variant.changes.get("compile") and len(ready["uncompiled"]) == len(sizes):
-                    raise VariantFailed("no size could be compiled")
-                self._sweep(process, variant, sizes, parts)
-        except VariantFailed as error:
-            self._failed.append(variant)
-            self.left_out.append(f"{variant.name}: {error}")
 
     @contextmanager
     def _loaded(self, variant: Variant, frames: Path | None) -> Iterator[tuple[LineProcess, Mapping[str, Any]]]:

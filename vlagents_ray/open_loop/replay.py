@@ -135,17 +135,13 @@ class ErrorTable:
         self.frames[:rows] += 1
         return float(error.mean())
 
-    def mean(self) -> np.ndarray:
-        return np.asarray(self.absolute / self.frames[:, np.newaxis])
-
     def to_json(self, joints: list[str]) -> dict[str, Any]:
         """Return the errors overall, by joint, by step, and by both, in the units of the actions."""
         total = max(1, int(self.frames.sum()))
         mae, rms = self.absolute.sum(0) / total, np.sqrt(self.square.sum(0) / total)
         largest = self.largest.max(0, initial=0)
-        by_step = zip(
-            self.frames, self.mean().mean(1), np.sqrt((self.square / self.frames[:, None]).mean(1)), strict=True
-        )
+        means, squares = (sums / self.frames[:, np.newaxis] for sums in (self.absolute, self.square))
+        by_step = zip(self.frames, means.mean(1), np.sqrt(squares.mean(1)), strict=True)
         return {
             "mae": float(mae.mean()),
             "rmse": float(np.sqrt((rms**2).mean())),
@@ -158,7 +154,7 @@ class ErrorTable:
                 {"step": step, "frames": int(frames), "mae": float(mean), "rmse": float(root)}
                 for step, (frames, mean, root) in enumerate(by_step)
             ],
-            "mae_by_step_and_joint": self.mean().tolist(),
+            "mae_by_step_and_joint": means.tolist(),
         }
 
 

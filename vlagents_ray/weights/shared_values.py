@@ -58,11 +58,8 @@ class SharedValues:
             key: [one.allocation.hex(), one.size, one.begin, one.counters.hex(), one.counter]
             for key, one in self.storages.items()
         }
-        return {
-            "gpu": self.gpu,
-            "storages": storages,
-            "views": {name: astuple(one) for name, one in self.views.items()},
-        }
+        views = {name: astuple(one) for name, one in self.views.items()}
+        return {"gpu": self.gpu, "storages": storages, "views": views}
 
     @classmethod
     def from_json(cls, node: dict[str, Any], others: Mapping[str, Any]) -> SharedValues:
