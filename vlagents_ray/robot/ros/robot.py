@@ -62,23 +62,21 @@ class TopicReader:
         """Decode the newest message, if any. An unreadable one is ignored, so that the reading ages."""
         with self._lock:
             came = self._came
-            if came is not None and came is not self._looked_at:
-                self._looked_at = came
-                self._keep(*came)
-
-    def _keep(self, message: Any, arrived_at: float) -> None:
-        try:
-            value = self._read(message)
-            at = (messages.stamp(message) if self._by_stamp else None) or arrived_at
-        except VLAgentsError as error:
-            self.unreadable += 1
-            if self.value is None:
-                raise ConfigError(f"{self.topic}: {error}") from error
-            if self.unreadable == 1:
-                logger.warning("%s: a message is left out, as are others like it: %s", self.topic, error)
-            return
-        self.value, self.captured_at = value, at
-        self._seen_at = self._clock(Obs(info={CAPTURED: at}))
+            if came is None or came is self._looked_at:
+                return
+            self._looked_at = message, arrived_at = came
+            try:
+                value = self._read(message)
+                at = (messages.stamp(message) if self._by_stamp else None) or arrived_at
+            except VLAgentsError as error:
+                self.unreadable += 1
+                if self.value is None:
+                    raise ConfigError(f"{self.topic}: {error}") from error
+                if self.unreadable == 1:
+                    logger.warning("%s: a message is left out, as are others like it: %s", self.topic, error)
+                return
+            self.value, self.captured_at = value, at
+            self._seen_at = self._clock(Obs(info={CAPTURED: at}))
 
     def _read(self, message: Any) -> Any:
         """Return the image, the part of the state or, by its first number, the gripper's opening in a message."""
@@ -138,7 +136,6 @@ class RosRobot:
         self._connections = self._link.connections
         try:
             self._wait_for_messages()
-            self._require_poses()
         except BaseException:
             self._link.close()
             raise
@@ -203,16 +200,14 @@ class RosRobot:
             if command.stop in ("", ZEROS):
                 self._publish(command, np.zeros(command.dim, np.float32))
             elif command.stop != NOTHING:
-                self._stop_where_it_is(command, self.settings.state[command.stop])
-
-    def _stop_where_it_is(self, command: ActionTopic, reading: InputTopic) -> None:
-        reader = self._readers[id(reading)]
-        reader.refresh()
-        if reader.age_s > self.settings.max_age_of(reading) or self._from_before_loss(reader):
-            self._stop_unsent = True  # until a pose is known
-            logger.warning("%s: not told where to stop, as %s is old", command.topic, reading.topic)
-        else:
-            self._publish(command, reader.value)
+                reading = self.settings.state[command.stop]
+                reader = self._readers[id(reading)]
+                reader.refresh()
+                if reader.age_s > self.settings.max_age_of(reading) or self._from_before_loss(reader):
+                    self._stop_unsent = True  # until a pose is known
+                    logger.warning("%s: not told where to stop, as %s is old", command.topic, reading.topic)
+                else:
+                    self._publish(command, reader.value)
 
     def _from_before_loss(self, reader: TopicReader) -> bool:
         return time.monotonic() - self._lost_at <= reader.age_s < math.inf
@@ -276,9 +271,13 @@ class RosRobot:
                 )
             time.sleep(_POLL_S)
         for reading in self.settings.sensors:
-            self._require_clock(self._readers[id(reading)], self.settings.silent_of(reading))
-
-    def _require_poses(self) -> None:
+            ago_s = time.time() - self._readers[id(reading)].captured_at
+            if not -SKEW_S <= ago_s <= self.settings.silent_of(reading):
+                when = f"{abs(ago_s):.3g} s {'ahead' if ago_s < 0 else 'ago'}"
+                raise ConfigError(
+                    f"{reading.topic}: got a message with the time stamp of {when}, want one of now; "
+                    f"synchronize the clocks of both machines, or count from the arrival: `clock: arrival`"
+                )
         for command in self.settings.actions:
             pose = self.settings.state.get(command.stop)
             if pose is not None and self._value(pose).shape != (command.dim,):
@@ -286,12 +285,3 @@ class RosRobot:
                     f"{command.topic}: stop: got {command.stop!r} with {len(self._value(pose))} numbers, want "
                     f"{command.dim}, as the topic takes; name a part of the state with these, in this order"
                 )
-
-    def _require_clock(self, reader: TopicReader, limit_s: float) -> None:
-        ago_s = time.time() - reader.captured_at
-        if not -SKEW_S <= ago_s <= limit_s:
-            when = f"{abs(ago_s):.3g} s {'ahead' if ago_s < 0 else 'ago'}"
-            raise ConfigError(
-                f"{reader.topic}: got a message with the time stamp of {when}, want one of now; "
-                f"synchronize the clocks of both machines, or count from the arrival: `clock: arrival`"
-            )
