@@ -74,7 +74,7 @@ class Chains:
         self._state_of = utils["get_env_state_for_initial_condition"]
         self._rules = rules = _definitions(
             evaluation / "multistep_sequences.py",
-            ProcessPoolExecutor=_Places,
+            ProcessPoolExecutor=lambda max_workers: contextlib.nullcontext(SimpleNamespace(map=_places)),  # noqa: ARG005
             deepcopy=copy.deepcopy,
             functools=functools,
             logging=logging,
@@ -97,20 +97,9 @@ class Chains:
         return Chain(found[place], *self._state_of(state))
 
 
-class _Places:
-    """Replaces the pool of processes: returns the seed and place of each chain of a state instead of the chains."""
-
-    def __init__(self, max_workers: int) -> None:
-        pass
-
-    def __enter__(self) -> _Places:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        pass
-
-    def map(self, _: Callable[..., Any], jobs: Iterable[tuple[Any, int, int]]) -> list[list[np.ndarray]]:
-        return [[np.array([seed, place]) for place in range(count)] for _, count, seed in jobs]
+def _places(_: Callable[..., Any], jobs: Iterable[tuple[Any, int, int]]) -> list[list[np.ndarray]]:
+    """Return the seed and place of each chain of a state, instead of the chains that CALVIN's processes would draw."""
+    return [[np.array([seed, place]) for place in range(count)] for _, count, seed in jobs]
 
 
 def fnv1_32(text: str) -> int:

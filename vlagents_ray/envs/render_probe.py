@@ -88,14 +88,17 @@ def without(modules: Sequence[str], cure: str) -> str | None:
 
 @contextlib.contextmanager
 def failing(env: str, doing: str) -> Iterator[None]:
-    """Turn errors of a simulator that renders through EGL into `EnvFailed`; errors of this package pass unchanged."""
+    """Turn errors of a simulator into `EnvFailed`, with the cure of its driver; this package's own pass unchanged."""
     try:
         yield
     except VLAgentsError:
         raise
     except Exception as error:
-        about_egl = any(word in str(error) for word in ("EGL", "OpenGL", "GLContext", "mjr_makeContext"))
-        cure = f"; {EGL_CURE}" if about_egl else ""
+        cure = ""
+        if any(word in str(error) for word in ("EGL", "OpenGL", "GLContext", "mjr_makeContext")):
+            cure = f"; {EGL_CURE}"
+        elif any(word in str(error) for word in ("vk::", "rendering device", "Vulkan")):
+            cure = f"; {vulkan_cure()}"
         raise EnvFailed(f"{env} failed to {doing}: {type(error).__name__}: {error}{cure}") from error
 
 

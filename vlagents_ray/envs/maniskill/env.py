@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
 from typing import Any
 
 import numpy as np
@@ -20,17 +19,13 @@ from vlagents_ray.interface import Act, Obs
 ON_GPU = ("gpu", "cuda", "physx_cuda")
 
 
-@dataclass(frozen=True, slots=True)
-class ManiSkillProtocol:
-    """The protocol in the section "Evaluation" of ManiSkill 3's guide to reinforcement learning."""
-
-    ignore_terminations: bool = True  # an episode continues to the step limit after success or failure
-    reconfiguration_freq: int = 1  # the scene is rebuilt for each episode, with other objects if the task draws them
-    metrics: tuple[str, ...] = ("success_once", "success_at_end")
-    seeds: str = "one an environment"  # each episode has its own seed, which determines all its random draws
-
-
-PROTOCOL = ManiSkillProtocol()
+# The section "Evaluation" of ManiSkill 3's guide to reinforcement learning.
+PROTOCOL = {
+    "ignore_terminations": True,  # an episode continues to the step limit after success or failure
+    "reconfiguration_freq": 1,  # the scene is rebuilt for each episode, with other objects if the task draws them
+    "metrics": ["success_once", "success_at_end"],
+    "seeds": "one an environment",  # each episode has its own seed, which determines all its random draws
+}
 
 
 class ManiSkill(SimulatorEnv):
@@ -239,5 +234,5 @@ def _described(simulator: Simulator, reconfigure: bool, max_steps: int, own_limi
         deviations.append("reconfigure is False: scenes are kept from episode to episode")
     if max_steps != own_limit:
         deviations.append(f"max_steps is {max_steps}, the task's own is {own_limit}")
-    protocol = {**asdict(PROTOCOL), "metrics": list(PROTOCOL.metrics), "deviations": deviations}
+    protocol = {**PROTOCOL, "deviations": deviations}
     return {**simulator.describe(), "reconfigure": reconfigure, "protocol": protocol}

@@ -70,7 +70,9 @@ class TabletopRenderer:
         resting = [p for p in world.pucks if p is not world.held]
         key = tuple([(p.x, p.y, p.z) for p in resting])
         if key != self._still_key:
-            self._still, self._still_key = self._draw_still(resting), key
+            self._still, self._still_key = self._floor_picture.copy(), key
+            for puck in sorted(resting, key=lambda p: (p.z, -p.y)):  # near ones over far ones, upper over lower
+                self._draw_puck_at(self._still, puck)
         image = self._still.copy()
         self._shade(image, self._gripper_shadow, world.x, world.y, world.z + _FINGER_LENGTH)
         if world.held is not None:
@@ -80,12 +82,6 @@ class TabletopRenderer:
             self._grippers[gap] = self._draw_gripper(float(gap))
         self._blend(image, self._grippers[gap], world.x, world.y, world.z)
         return image
-
-    def _draw_still(self, pucks: list[Puck]) -> np.ndarray:
-        picture = self._floor_picture.copy()
-        for puck in sorted(pucks, key=lambda p: (p.z, -p.y)):  # near ones over far ones, upper over lower
-            self._draw_puck_at(picture, puck)
-        return picture
 
     def _draw_puck_at(self, image: np.ndarray, puck: Puck) -> None:
         self._shade(image, self._puck_shadow, puck.x, puck.y, puck.z + PUCK_HEIGHT / 3)
