@@ -31,9 +31,8 @@ import numpy as np
 
 from vlagents_ray.contract import ActionSpec, CameraSpec, Contract, StateSpec
 from vlagents_ray.envs import graphics
-from vlagents_ray.envs.graphics import EGL_DEVICE, Renderer
-from vlagents_ray.envs.render_probe import EGL_CURE, without
-from vlagents_ray.envs.simulator import BenchmarkProtocol, SimulatorEnv
+from vlagents_ray.envs.graphics import EGL_CURE, EGL_DEVICE, Renderer
+from vlagents_ray.envs.simulator import BenchmarkProtocol, SimulatorEnv, without
 from vlagents_ray.errors import ConfigError, EnvFailed, NotReset
 from vlagents_ray.interface import Obs
 from vlagents_ray.ray_tools.git_state import code_in

@@ -18,8 +18,7 @@ import numpy as np
 from vlagents_ray.contract import ActionSpec, CameraSpec, Contract, StateSpec
 from vlagents_ray.envs.base import EvalEnv, one_row, require_known
 from vlagents_ray.envs.graphics import prepare_rendering
-from vlagents_ray.envs.render_probe import without
-from vlagents_ray.envs.simulator import BenchmarkProtocol
+from vlagents_ray.envs.simulator import BenchmarkProtocol, without
 from vlagents_ray.errors import ConfigError, EnvFailed, MissingDependency, NotReset, UnknownEnv, VLAgentsError
 from vlagents_ray.interface import Act, Obs
 from vlagents_ray.registry import require

@@ -30,9 +30,8 @@ import numpy as np
 from vlagents_ray.contract import CameraSpec, Contract, StateSpec
 from vlagents_ray.envs.base import DELTA_POSE
 from vlagents_ray.envs.graphics import prepare_rendering
-from vlagents_ray.envs.render_probe import failing
 from vlagents_ray.envs.robosuite import CameraRenderer, gripper_opening, importing_robosuite, seeded
-from vlagents_ray.envs.simulator import SimulatorEnv
+from vlagents_ray.envs.simulator import SimulatorEnv, failing
 from vlagents_ray.errors import ConfigError, EnvFailed, MissingDependency, UnknownEnv
 from vlagents_ray.interface import Obs
 from vlagents_ray.naming import did_you_mean

@@ -20,9 +20,8 @@ import numpy as np
 
 from vlagents_ray.contract import CameraSpec, Contract, StateSpec
 from vlagents_ray.envs.base import DELTA_POSE
-from vlagents_ray.envs.render_probe import failing
 from vlagents_ray.envs.robosuite import RobosuiteEnv, importing_robosuite, seeded
-from vlagents_ray.envs.simulator import BenchmarkProtocol
+from vlagents_ray.envs.simulator import BenchmarkProtocol, failing
 from vlagents_ray.errors import ConfigError, EnvFailed
 from vlagents_ray.interface import Obs
 from vlagents_ray.registry import require

@@ -20,8 +20,7 @@ import numpy as np
 
 from vlagents_ray.contract import CameraSpec, Contract, StateSpec
 from vlagents_ray.envs.base import DELTA_POSE
-from vlagents_ray.envs.graphics import EGL_DEVICE, GPUS
-from vlagents_ray.envs.render_probe import EGL_CURE
+from vlagents_ray.envs.graphics import EGL_CURE, EGL_DEVICE, GPUS
 from vlagents_ray.envs.simulator import BenchmarkProtocol, SimulatorEnv
 from vlagents_ray.errors import ConfigError, EnvFailed
 from vlagents_ray.interface import Obs

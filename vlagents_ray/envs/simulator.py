@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib.util
 import os
 from abc import abstractmethod
 from collections.abc import Collection, Iterator, Sequence
@@ -14,9 +15,8 @@ import numpy as np
 
 from vlagents_ray.contract import Contract
 from vlagents_ray.envs.base import EvalEnv, Options, one_row, require_cameras, require_known
-from vlagents_ray.envs.graphics import prepare_rendering
-from vlagents_ray.envs.render_probe import egl_probe, failing, without
-from vlagents_ray.errors import ConfigError, EnvFailed, NotReset
+from vlagents_ray.envs.graphics import EGL_CURE, egl_probe, prepare_rendering, vulkan_cure
+from vlagents_ray.errors import ConfigError, EnvFailed, NotReset, VLAgentsError
 from vlagents_ray.interface import Act, Obs
 from vlagents_ray.registry import require
 
@@ -241,3 +241,25 @@ def require_sizes(env: str, **sizes: int | None) -> None:
 
 def camera_names(model: Any) -> list[str]:
     return [model.camera(i).name for i in range(model.ncam)]
+
+
+def without(modules: Sequence[str], cure: str) -> str | None:
+    """Return which of these modules are not installed, with the cure; None if all are."""
+    missing = next((module for module in modules if importlib.util.find_spec(module) is None), None)
+    return None if missing is None else f"{missing} is not installed; {cure}"
+
+
+@contextmanager
+def failing(env: str, doing: str) -> Iterator[None]:
+    """Turn errors of a simulator into `EnvFailed`, with the cure of its driver; this package's own pass unchanged."""
+    try:
+        yield
+    except VLAgentsError:
+        raise
+    except Exception as error:
+        cure = ""
+        if any(word in str(error) for word in ("EGL", "OpenGL", "GLContext", "mjr_makeContext")):
+            cure = f"; {EGL_CURE}"
+        elif any(word in str(error) for word in ("vk::", "rendering device", "Vulkan")):
+            cure = f"; {vulkan_cure()}"
+        raise EnvFailed(f"{env} failed to {doing}: {type(error).__name__}: {error}{cure}") from error

@@ -9,10 +9,9 @@ import numpy as np
 
 from vlagents_ray.contract import Contract
 from vlagents_ray.envs.base import BatchEnv, Options, Steps, episodes_of, one_row
-from vlagents_ray.envs.graphics import Renderer
+from vlagents_ray.envs.graphics import Renderer, render_probe
 from vlagents_ray.envs.maniskill.simulator import INSTRUCTIONS, Simulator, step_limits
-from vlagents_ray.envs.render_probe import render_probe, without
-from vlagents_ray.envs.simulator import SimulatorEnv, require_sizes
+from vlagents_ray.envs.simulator import SimulatorEnv, require_sizes, without
 from vlagents_ray.errors import ConfigError, NotReset
 from vlagents_ray.interface import Act, Obs
 

@@ -20,9 +20,8 @@ import numpy as np
 
 from vlagents_ray.contract import ActionSpec, CameraSpec, Contract, StateSpec
 from vlagents_ray.envs.base import require_cameras
-from vlagents_ray.envs.graphics import Renderer, prepare_rendering, vulkan_renderer
-from vlagents_ray.envs.render_probe import failing, vulkan_device
-from vlagents_ray.envs.simulator import require_sizes
+from vlagents_ray.envs.graphics import Renderer, prepare_rendering, vulkan_device, vulkan_renderer
+from vlagents_ray.envs.simulator import failing, require_sizes
 from vlagents_ray.errors import ConfigError, EnvFailed, UnknownEnv
 from vlagents_ray.interface import Obs
 from vlagents_ray.registry import require
