@@ -11,6 +11,7 @@ LIBERO-PRO. Meshes and textures of the scenes are in five further packages; this
 from __future__ import annotations
 
 import codecs
+import contextlib
 import functools
 import hashlib
 import importlib.util
@@ -416,7 +417,15 @@ class LiberoSimulation:
         self._cameras.make_current()  # frees the rendering resources of the last episode in their own context
         self._cameras.open = False
         with seeded(self._protocol.simulator_seed):
-            self._reset()
+            crowded = require("robosuite.utils.errors").RandomizationError
+            for _ in range(
+                _ATTEMPTS
+            ):  # in place of `OffScreenRenderEnv.reset`, which repeats after any error, without end
+                with contextlib.suppress(crowded):  # the drawn places overlap: draw again
+                    self._env.env.reset()
+                    break
+            else:
+                raise EnvFailed(f"the scene's objects found no place in {_ATTEMPTS} draws")
             self._cameras.open = settling == 0
             raw = self._env.set_init_state(state)
             success = bool(self._env.check_success())
@@ -451,17 +460,6 @@ class LiberoSimulation:
     def close(self) -> None:
         self._cameras.make_current()
         self._env.close()
-
-    def _reset(self) -> None:
-        """Replace `OffScreenRenderEnv.reset`, which repeats itself after any error, without end."""
-        crowded = require("robosuite.utils.errors").RandomizationError
-        for _ in range(_ATTEMPTS):
-            try:
-                self._env.env.reset()
-            except crowded:  # the drawn places overlap: draw again
-                continue
-            return
-        raise EnvFailed(f"the scene's objects found no place in {_ATTEMPTS} draws")
 
     def _use_assets(self) -> None:
         self._package._assets_path_cache = str(self._assets)  # per process: another env may have set another

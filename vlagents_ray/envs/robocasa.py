@@ -191,7 +191,15 @@ class RoboCasa(RobosuiteEnv):
         self._order = _FROM_BASE_FIRST if action_order == "base_first" else list(range(12))
         self._registries = tuple(object_registries)
         images = self._contract.cameras or {}
-        simulator = self._load()
+        require_assets(self._registries)
+        with (
+            failing(self._name, "import robocasa"),
+            importing_robosuite("robocasa"),
+            contextlib.redirect_stdout(io.StringIO()),  # advice about packages that are not needed
+            warnings.catch_warnings(),
+        ):
+            warnings.simplefilter("ignore")  # warnings of upstream code
+            simulator: Any = require("robocasa")
         with self._making(), seeded(0):
             made = simulator.utils.env_utils.create_env(
                 task,
@@ -205,17 +213,6 @@ class RoboCasa(RobosuiteEnv):
             made.use_camera_obs = made.has_offscreen_renderer = bool(images)  # before the first reset loads the model
             self._use(made)
         self._versions = {"robocasa": simulator.__version__, "robosuite": simulator.robosuite.__version__}
-
-    def _load(self) -> Any:
-        require_assets(self._registries)
-        with (
-            failing(self._name, "import robocasa"),
-            importing_robosuite("robocasa"),
-            contextlib.redirect_stdout(io.StringIO()),  # advice about packages that are not needed
-            warnings.catch_warnings(),
-        ):
-            warnings.simplefilter("ignore")  # warnings of upstream code
-            return require("robocasa")
 
     @classmethod
     def known_contract(cls, arguments: Mapping[str, Any]) -> Contract:

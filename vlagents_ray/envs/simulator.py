@@ -112,11 +112,17 @@ class SimulatorEnv(EvalEnv):
         seed selects. There are no other options.
         """
         self._alive()
-        state = self._initial_state(seed, options or {})
+        options, count = options or {}, self.init_states
+        if unknown := sorted(set(options) - ({"init_state"} if count is not None else set())):
+            want = "none" if count is None else "init_state or none"
+            raise ConfigError(f"{self._name}: unknown reset options {unknown}, want {want}")
+        state = options.get("init_state", seed % (count or 1))
+        if type(state) is not int or not 0 <= state < (count or 1):
+            raise ConfigError(f"{self._name}: init_state is {state!r}, want 0 to {(count or 1) - 1}")
         with failing(self._name, "reset"):
             obs, info = self._begin(seed % 2**32, state)
         self._steps = 0
-        return obs, {"success": False} | ({} if self.init_states is None else {"init_state": state}) | info
+        return obs, {"success": False} | ({} if count is None else {"init_state": state}) | info
 
     def step(self, act: Act) -> tuple[Obs, float, bool, bool, dict[str, Any]]:
         self._alive()
@@ -162,17 +168,6 @@ class SimulatorEnv(EvalEnv):
     def _solved(self, success: bool) -> tuple[bool, dict[str, Any]]:
         """Return `terminated` and `info` for a step, given whether the task is solved after it."""
         return success and self._ends_on_success, {"success": success}
-
-    def _initial_state(self, seed: int, options: Options) -> int:
-        count = self.init_states
-        unknown = sorted(set(options) - ({"init_state"} if count is not None else set()))
-        if unknown:
-            want = "none" if count is None else "init_state or none"
-            raise ConfigError(f"{self._name}: unknown reset options {unknown}, want {want}")
-        state = options.get("init_state", seed % (count or 1))
-        if type(state) is not int or not 0 <= state < (count or 1):
-            raise ConfigError(f"{self._name}: init_state is {state!r}, want 0 to {(count or 1) - 1}")
-        return state
 
     def _alive(self) -> Any:
         if self._env is None:

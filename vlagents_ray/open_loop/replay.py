@@ -8,7 +8,7 @@ import uuid
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 from functools import partial
 from itertools import islice
 from pathlib import Path
@@ -159,16 +159,6 @@ class ErrorTable:
 
 
 @dataclass(frozen=True, slots=True)
-class FrameError:
-    """The mean absolute error of one frame's chunk."""
-
-    dataset: str
-    episode: int
-    frame: int
-    mae: float
-
-
-@dataclass(frozen=True, slots=True)
 class ReplayPlan:
     """The settings of a replay."""
 
@@ -189,12 +179,12 @@ class OpenLoopResult:
     table: ErrorTable
     sessions: int = 0
     missing: int = 0  # acts that the recording lacks, so that a policy with a history received less
-    frames: list[FrameError] = field(default_factory=list)
+    frames: list[dict[str, Any]] = field(default_factory=list)  # dataset, episode, frame, and its chunk's "mae"
 
     def to_json(self) -> dict[str, Any]:
         by_episode: dict[tuple[str, int], list[float]] = {}
         for one in self.frames:
-            by_episode.setdefault((one.dataset, one.episode), []).append(one.mae)
+            by_episode.setdefault((one["dataset"], one["episode"]), []).append(one["mae"])
         return {
             "datasets": self.datasets,
             "against": self.against,
@@ -206,7 +196,7 @@ class OpenLoopResult:
                 {"dataset": dataset, "episode": episode, "frames": len(errors), "mae": float(np.mean(errors))}
                 for (dataset, episode), errors in sorted(by_episode.items())
             ],
-            "worst": [asdict(one) for one in sorted(self.frames, key=lambda one: -one.mae)[:_WORST]],
+            "worst": sorted(self.frames, key=lambda one: -one["mae"])[:_WORST],
         }
 
 
@@ -250,7 +240,8 @@ def replay(folder: Path, sessions: Sessions, plan: ReplayPlan) -> OpenLoopResult
                 rows = min(len(expected), len(got), plan.horizon or len(got))
                 with lock:
                     mae = result.table.add(expected[:rows], got[:rows])
-                    result.frames.append(FrameError(part.dataset.root.name, part.index, step.frame, mae))
+                    place = {"dataset": part.dataset.root.name, "episode": part.index, "frame": step.frame}
+                    result.frames.append({**place, "mae": mae})
         finally:
             agent.close()
         with lock:

@@ -12,7 +12,6 @@ import json
 import os
 import shutil
 import tempfile
-from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -131,7 +130,14 @@ class Dataset:
 
         for key, path in episode.videos.items():
             _move(path, self.root / VIDEO.format(video_key=key, **place))
-        self._parquet(self._table(rows, episode.features), DATA.format(**place))
+        pa, columns = self._pa, dict[str, Any]()
+        for key, values in rows.items():
+            if episode.features[key]["shape"] == [1]:  # LeRobot reads a single number as a scalar, not as a list
+                columns[key] = pa.array(values.reshape(-1), getattr(pa, _ARROW[episode.features[key]["dtype"]])())
+            else:
+                flat = pa.array(np.ascontiguousarray(values, np.float32).ravel())
+                columns[key] = pa.FixedSizeListArray.from_arrays(flat, values.shape[1])
+        self._parquet(pa.table(columns), DATA.format(**place))
         self._parquet(self._tasks_table(), "meta/tasks.parquet")
         self._parquet(self._pa.Table.from_pylist([about]), EPISODES.format(**place))
         stats = joined(self._stats, stats)
@@ -173,17 +179,6 @@ class Dataset:
                         key, _, name = column.removeprefix("stats/").rpartition("/")
                         found.setdefault(key, {})[name] = np.array(value)
                 self._stats = joined(self._stats, found)
-
-    def _table(self, rows: Mapping[str, np.ndarray], features: Mapping[str, Any]) -> Any:
-        pa = self._pa
-        columns = {}
-        for key, values in rows.items():
-            if features[key]["shape"] == [1]:  # LeRobot reads a single number as a scalar, not as a list
-                columns[key] = pa.array(values.reshape(-1), getattr(pa, _ARROW[features[key]["dtype"]])())
-            else:
-                flat = pa.array(np.ascontiguousarray(values, np.float32).ravel())
-                columns[key] = pa.FixedSizeListArray.from_arrays(flat, values.shape[1])
-        return pa.table(columns)
 
     def _tasks_table(self) -> Any:
         """Make the table of tasks in the format that LeRobot reads: that of a pandas frame indexed by task."""

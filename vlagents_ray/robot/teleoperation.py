@@ -324,10 +324,10 @@ class Terminal:
             termios.tcsetattr(self.descriptor, termios.TCSADRAIN, before)
 
     @contextlib.contextmanager
-    def consumed_by(self, consumer: Consumer) -> Iterator[None]:
-        """Pass the keys to a consumer within the context, unless another one begins in it."""
+    def consumed_by(self, consumer: Consumer, *, last: bool = False) -> Iterator[None]:
+        """Pass the keys to a consumer within the context, as the newest or, with `last`, after all others."""
         with self._lock:
-            self._own.append(consumer)
+            self._own.insert(0 if last else len(self._own), consumer)
         try:
             yield
         finally:
@@ -362,16 +362,13 @@ class Terminal:
                 pass
 
         thread = threading.Thread(target=read, name="vlagents-ray-terminal", daemon=True)
-        with self._lock:
-            self._own.insert(0, consumer)
-        thread.start()
-        try:
-            yield
-        finally:
-            over.set()
-            thread.join()
-            with self._lock:
-                self._own.remove(consumer)
+        with self.consumed_by(consumer, last=True):
+            thread.start()
+            try:
+                yield
+            finally:
+                over.set()
+                thread.join()
 
     def _is_in_foreground(self) -> bool:
         """Return whether this process may read: in the background, reading from the terminal would suspend it."""

@@ -258,8 +258,15 @@ def read_image(key: str, value: Any, layout: str, limits: Limits) -> np.ndarray:
     """Return an image as (H, W, 3) uint8 RGB; raise `InvalidObservation` or `MessageTooLarge`."""
     if isinstance(value, np.ndarray):
         value = _newest(key, value, 3)
-        if value.dtype.kind == "f":
-            value = _eight_bits(key, value)
+        if (
+            value.dtype.kind == "f"
+        ):  # converted as in openpi's own server (`_parse_image` in its policies): rounded down
+            if value.size and not (value.min() >= 0 and value.max() <= 1):  # also true for NaN
+                raise InvalidObservation(
+                    f"camera {key!r}: got {value.dtype} from {value.min():g} to {value.max():g}, want uint8, or floats "
+                    f"in [0, 1]; scale it"
+                )
+            value = (255 * value).astype(np.uint8)
         if layout == "rgba" and value.ndim == 3 and value.shape[2] == 4:
             value = np.ascontiguousarray(value[:, :, :3])
         elif layout in ("chw", "any") and value.ndim == 3 and value.shape[0] == 3:
@@ -267,16 +274,6 @@ def read_image(key: str, value: Any, layout: str, limits: Limits) -> np.ndarray:
         elif layout == "chw":
             raise InvalidObservation(f"camera {key!r}: got {value.shape} {value.dtype}, want (3, H, W) uint8 RGB")
     return as_camera(key, value, limits)
-
-
-def _eight_bits(key: str, image: np.ndarray) -> np.ndarray:
-    """Convert floats in [0, 1] to uint8, rounded down as in openpi's own server (`_parse_image` in its policies)."""
-    if image.size and not (image.min() >= 0 and image.max() <= 1):  # also true for NaN
-        raise InvalidObservation(
-            f"camera {key!r}: got {image.dtype} from {image.min():g} to {image.max():g}, want uint8, or floats "
-            f"in [0, 1]; scale it"
-        )
-    return (255 * image).astype(np.uint8)
 
 
 def may_be_camera(value: Any) -> bool:
