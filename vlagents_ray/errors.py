@@ -2,42 +2,18 @@
 
     VLAgentsError
     ├── InvalidInput (also ValueError)      the request is wrong; sending it again will not help
-    │   ├── MalformedMessage     400        the bytes cannot be decoded
-    │   ├── MessageTooLarge      413        a body, an image or a nesting exceeds the server's limit
-    │   ├── InvalidObservation   422        a wrong shape, type or value
-    │   │   ├── MissingCamera    422
-    │   │   ├── MissingState     422
-    │   │   └── NotOffered       422        `info["want"]` names an unknown value
-    │   ├── UnknownSession       404        expired, closed, or never reset
-    │   ├── UnknownApp           404        no such application on this server
-    │   ├── UnknownCheckpoint    400        the deployment does not offer the checkpoint named in a reset
-    │   ├── NotReset             409        `act` before `reset`
-    │   ├── ContractMismatch     409        robot or env and policy do not fit together
-    │   ├── InvalidWeights       422        pushed weights do not fit the policy
-    │   ├── UnchangedWeights     409        pushed weights equal those that the policy holds
-    │   ├── NotTrainable         409        the policy names no parameters that could be replaced
-    │   ├── WeightsNotStaged     409        the version of weights to be served is not held here
-    │   ├── Unauthorized         401        the API key is missing, unknown, revoked or expired
-    │   └── Forbidden            403        the API key is not for this application
-    ├── Overloaded               503        too many requests in flight; not executed, so send it again later
-    ├── TooManyRequests          429        the rate or the sessions of the API key are exceeded
-    ├── PolicyFailed             500        the policy raised an exception
-    │   ├── InvalidAction        500        the policy returned an unusable action
-    │   └── CheckpointFailed     500        the checkpoint named in a reset did not load
-    ├── PolicyUnavailable        503        the server is not ready, is restarting, is full, or not reachable
-    │   ├── NoReplica            503        no replica runs; the proxy answers this and executed nothing
-    │   └── ConnectionLost       503        the connection broke; the request may have been executed
-    ├── DeadlineExceeded         504        no answer in time (also TimeoutError); if a server raised it, not executed
-    │   └── OutcomeUnknown       504        the deadline passed during inference: the session counts the step
-    ├── ConfigError (also ValueError)       a setting is unknown, missing or contradictory
-    │   ├── UnknownPolicy
-    │   │   └── UnknownWrapper
-    │   ├── UnknownEnv
-    │   └── WeightsLost                     the policy acts with weights other than those that were pushed
-    ├── EnvFailed                           a simulator failed: infrastructure, never the policy
-    ├── StorageFailed                       results cannot be written: a full disk, no permission
-    ├── ClusterLost                         the head of the Ray cluster no longer answers
-    └── MissingDependency (also ImportError)
+    │   ├── MalformedMessage, MessageTooLarge
+    │   ├── InvalidObservation              MissingCamera, MissingState, NotOffered
+    │   ├── UnknownSession, UnknownApp, UnknownCheckpoint, NotReset, ContractMismatch
+    │   ├── InvalidWeights, UnchangedWeights, NotTrainable, WeightsNotStaged
+    │   └── Unauthorized, Forbidden
+    ├── Overloaded, TooManyRequests         not executed; send it again later
+    ├── PolicyFailed                        InvalidAction, CheckpointFailed
+    ├── PolicyUnavailable                   NoReplica, ConnectionLost
+    ├── DeadlineExceeded (also TimeoutError)
+    │   └── OutcomeUnknown
+    ├── ConfigError (also ValueError)       UnknownPolicy (UnknownWrapper), UnknownEnv, WeightsLost
+    └── EnvFailed, StorageFailed, ClusterLost, MissingDependency (also ImportError)
 
 `code` is stable: by default the name of the class, "unknown_session" of `UnknownSession`. A server sends it in a
 problem+json document, with `status` as the HTTP status. A message states the received and the expected value, and the
