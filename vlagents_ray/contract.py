@@ -15,7 +15,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from vlagents_ray.errors import ContractMismatch, MalformedMessage
+from vlagents_ray.errors import ConfigError, ContractMismatch, MalformedMessage
 from vlagents_ray.naming import says_its_fields
 
 _MOST_PARTS = 12  # of the env's state, whose combinations are tried
@@ -100,14 +100,14 @@ class Contract:
         Raises:
             MalformedMessage: The document has an unknown key or a value of a wrong type.
         """
-        top = _closed(cls, data, "contract")
+        top = closed(cls, data, "contract")
         for name, spec in (("cameras", CameraSpec), ("state", StateSpec)):
             if top.get(name) is not None:
                 if not isinstance(top[name], dict):
                     raise MalformedMessage(f"contract.{name}: got {type(top[name]).__name__}, want an object")
-                top[name] = {str(k): spec(**_closed(spec, v, f"contract.{name}.{k}")) for k, v in top[name].items()}
+                top[name] = {str(k): spec(**closed(spec, v, f"contract.{name}.{k}")) for k, v in top[name].items()}
         if "action" in top:
-            action = _closed(ActionSpec, top["action"], "contract.action")
+            action = closed(ActionSpec, top["action"], "contract.action")
             top["action"] = ActionSpec(**{**action, "arms": _names(action.get("arms"), "contract.action.arms")})
         return cls(**{**top, "behaviour": _names(top.get("behaviour"), "contract.behaviour")})
 
@@ -239,11 +239,13 @@ def require_match(policy: Contract | None, env: Contract | None) -> None:
         raise ContractMismatch("policy and env do not fit:\n" + "\n".join(f"- {line}" for line in found))
 
 
-def _closed(cls: type, data: object, where: str) -> dict[str, Any]:
+def closed(
+    cls: type, data: object, where: str, error: type[MalformedMessage | ConfigError] = MalformedMessage
+) -> dict[str, Any]:
+    """Return the entries of `data`; raise `error` unless it is a mapping with only fields of the dataclass `cls`."""
     if not isinstance(data, Mapping):
-        raise MalformedMessage(f"{where}: got {type(data).__name__}, want an object")
-    known = {f.name for f in fields(cls)}
-    unknown = set(map(str, data)) - known
-    if unknown:
-        raise MalformedMessage(f"{where}: unknown keys {sorted(unknown)}, want some of {sorted(known)}")
-    return {str(k): v for k, v in data.items()}
+        raise error(f"{where}: got {type(data).__name__}, want an object")
+    known = [one.name for one in fields(cls)]
+    if unknown := sorted(str(key) for key in data if key not in known):
+        raise error(f"{where}: unknown keys {unknown}, want some of {sorted(known)}")
+    return dict(data)

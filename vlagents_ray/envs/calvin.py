@@ -1,9 +1,4 @@
-"""CALVIN: chains of five tasks, given in words, at a table with drawer, sliding door, lights and blocks.
-
-with Calvin("D") as env:
-    obs, _ = env.reset(seed=0)
-    obs, reward, terminated, truncated, info = env.step(Act(action=np.array([0, 0, 0, 0, 0, 0, 1], np.float32)))
-"""
+"""CALVIN: chains of five tasks, given in words, at a table with drawer, sliding door, lights and blocks."""
 
 from __future__ import annotations
 

@@ -1,9 +1,4 @@
-"""RoboCasa365's kitchen tasks: a Panda arm on a mobile base, in MuJoCo; the fifty of its evaluation.
-
-with RoboCasa("NavigateKitchen") as env:
-    obs, _ = env.reset(seed=0)
-    obs, reward, terminated, truncated, info = env.step(Act(action=np.zeros(12, np.float32)))
-"""
+"""RoboCasa365's kitchen tasks: a Panda arm on a mobile base, in MuJoCo; the fifty of its evaluation."""
 
 from __future__ import annotations
 

@@ -1,9 +1,4 @@
-"""robosuite's tasks of the robomimic study: Panda arms at a table in MuJoCo.
-
-with Robosuite("Lift") as env:
-    obs, _ = env.reset(seed=0)
-    obs, reward, terminated, truncated, info = env.step(Act(action=np.zeros(7, np.float32)))
-"""
+"""robosuite's tasks of the robomimic study: Panda arms at a table in MuJoCo."""
 
 from __future__ import annotations
 

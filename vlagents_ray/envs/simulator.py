@@ -50,6 +50,10 @@ class BenchmarkProtocol:
 class SimulatorEnv(EvalEnv):
     """One environment of a simulator in this process.
 
+        with RoboCasa("NavigateKitchen") as env:
+            obs, _ = env.reset(seed=0)
+            obs, reward, terminated, truncated, info = env.step(Act(action=np.zeros(12, np.float32)))
+
     A subclass sets the class variables below, makes its simulator in the constructor within `_making`, and registers
     its clean-up with `_resources`. `_begin` begins an episode and `_advance` executes a step; both are only called
     while the simulator is open, and their errors become `EnvFailed`.

@@ -30,7 +30,7 @@ from typing import Any, Literal, TypeVar
 
 import numpy as np
 
-from vlagents_ray.contract import ActionSpec, Contract
+from vlagents_ray.contract import ActionSpec, Contract, closed
 from vlagents_ray.errors import (
     ConfigError,
     InvalidAction,
@@ -100,17 +100,6 @@ class ActionGripper:
     closed: float = 0.0
 
 
-def closed(cls: type, data: object, where: str) -> dict[str, Any]:
-    """Return the fields in `data`; raise `ConfigError` for a field that `cls` lacks."""
-    if not isinstance(data, Mapping):
-        raise ConfigError(f"{where}: got {type(data).__name__}, want an object")
-    known = [one.name for one in fields(cls)]
-    unknown = sorted(str(key) for key in data if key not in known)
-    if unknown:
-        raise ConfigError(f"{where}: unknown keys {unknown}, want some of {known}")
-    return dict(data)
-
-
 def each(top: Mapping[str, Any], name: str, read: Callable[[Any, str], T]) -> dict[str, T]:
     """Return the entries of `top[name]`, each the result of `read(value, where)`; `where` is its path, for errors."""
     entries = top.get(name) or {}
@@ -121,7 +110,7 @@ def each(top: Mapping[str, Any], name: str, read: Callable[[Any, str], T]) -> di
 
 def entry(cls: type[T], value: Any, where: str) -> T:
     """Return an entry of a mapping as the dataclass `cls`; a text is its key."""
-    values = closed(cls, {"key": value} if isinstance(value, str) else value, where)
+    values = closed(cls, {"key": value} if isinstance(value, str) else value, where, ConfigError)
     known = {one.name: str(one.type) for one in fields(cls)}  # type: ignore[arg-type]
     for name, got in values.items():
         if not _FITS[known[name]](got):
@@ -372,7 +361,7 @@ class KeyMapping:
     @classmethod
     def from_json(cls, data: Mapping[str, Any]) -> KeyMapping:
         """Read a mapping from plain JSON values; raise `ConfigError` for an unknown key or a wrong type."""
-        top = closed(cls, data, "mapping")
+        top = closed(cls, data, "mapping", ConfigError)
         instruction = top.get("instruction")
         if instruction is not None and not isinstance(instruction, str):
             raise ConfigError(f"mapping.instruction: got {type(instruction).__name__}, want a key")
