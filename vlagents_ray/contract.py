@@ -8,6 +8,7 @@ simulator that renders upside down rotates them.
 
 from __future__ import annotations
 
+import json
 from collections.abc import Iterator, Mapping
 from dataclasses import asdict, dataclass, field, fields
 from itertools import combinations
@@ -88,7 +89,8 @@ class Contract:
         stated = asdict(self)
         if self.behaviour is None:
             del stated["behaviour"]  # only policies for learners state it
-        return {key: _plain(value) for key, value in stated.items()}
+        plain: dict[str, Any] = json.loads(json.dumps(stated, default=np.generic.item))
+        return plain
 
     @classmethod
     def from_json(cls, data: object) -> Contract:
@@ -118,14 +120,6 @@ def _names(value: object, where: str) -> tuple[str, ...] | None:
     if value is not None:
         raise MalformedMessage(f"{where}: got {value!r}, want a list of names")
     return None
-
-
-def _plain(value: Any) -> Any:
-    if isinstance(value, Mapping):
-        return {key: _plain(item) for key, item in value.items()}
-    if isinstance(value, tuple):
-        return list(value)
-    return value.item() if isinstance(value, np.generic) else value
 
 
 def differences(policy: Contract, env: Contract) -> list[str]:

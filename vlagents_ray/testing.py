@@ -272,10 +272,8 @@ class _AgentSuite:
         return session
 
     def play_alone(self, i: int, steps: int) -> list[Act]:
-        session = self.begin(i)
-        given = [self.act(i, session)]
-        kept = [copy.deepcopy(given[0])]
-        for _ in range(steps - 1):
+        session, given, kept = self.begin(i), list[Act](), list[Act]()
+        for _ in range(steps):
             given.append(self.act(i, session))
             kept.append(copy.deepcopy(given[-1]))
         require_same(kept, given, "an earlier act", "a later one changed it: give a new array each time")

@@ -185,11 +185,7 @@ class Gymnasium(EvalEnv):
 
     @classmethod
     def missing(cls) -> str | None:
-        try:
-            require("gymnasium")
-        except MissingDependency as error:
-            return str(error)
-        return None
+        return without(("gymnasium",), "pip install 'vlagents-ray[sim]'")
 
     @property
     def contract(self) -> Contract:
