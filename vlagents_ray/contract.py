@@ -226,10 +226,7 @@ _ACTION_CURES = {
 
 def require_match(policy: Contract | None, env: Contract | None) -> None:
     """Raise `ContractMismatch` with every difference between the contracts of a policy and an env."""
-    if policy is None or env is None:
-        return
-    found = differences(policy, env)
-    if found:
+    if policy is not None and env is not None and (found := differences(policy, env)):
         raise ContractMismatch("policy and env do not fit:\n" + "\n".join(f"- {line}" for line in found))
 
 

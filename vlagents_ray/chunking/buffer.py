@@ -156,11 +156,9 @@ class ChunkBuffer:
 
     def drop(self, before: float = math.inf) -> bool:
         """Drop chunks with observations from before a time, s of `time.monotonic`; return whether there were any."""
-        kept = [chunk for chunk in self._chunks if chunk.seen_at >= before]
-        dropped = len(kept) < len(self._chunks)
-        if dropped:
-            self._chunks = deque(kept)
-        return dropped
+        count, kept = len(self._chunks), deque(chunk for chunk in self._chunks if chunk.seen_at >= before)
+        self._chunks = kept
+        return len(kept) < count
 
     def _at(self, place: int) -> Step | None:
         for newest in reversed(self._chunks):

@@ -138,7 +138,22 @@ class Dataset:
                 flat = pa.array(np.ascontiguousarray(values, np.float32).ravel())
                 columns[key] = pa.FixedSizeListArray.from_arrays(flat, values.shape[1])
         self._parquet(pa.table(columns), DATA.format(**place))
-        self._parquet(self._tasks_table(), "meta/tasks.parquet")
+        # The table of tasks in the format that LeRobot reads: that of a pandas frame indexed by task.
+        name = "__index_level_0__"
+        text: dict[str, Any] = {"pandas_type": "unicode", "numpy_type": "object"}
+        described: list[dict[str, Any]] = [
+            {"name": "task_index", "field_name": "task_index", "pandas_type": "int64", "numpy_type": "int64"},
+            {"name": None, "field_name": name, **text},
+        ]
+        pandas = {
+            "index_columns": [name],
+            "column_indexes": [{"name": None, "field_name": None, **text, "metadata": {"encoding": "UTF-8"}}],
+            "columns": [{**column, "metadata": None} for column in described],
+            "creator": {"library": "pyarrow", "version": pa.__version__},
+            "pandas_version": "2.2.0",
+        }
+        tasks = pa.table({"task_index": pa.array(range(len(self.tasks)), pa.int64()), name: pa.array(self.tasks)})
+        self._parquet(tasks.replace_schema_metadata({"pandas": json.dumps(pandas)}), "meta/tasks.parquet")
         self._parquet(self._pa.Table.from_pylist([about]), EPISODES.format(**place))
         stats = joined(self._stats, stats)
         total = {"total_episodes": number + 1, "total_frames": first + frames, "total_tasks": len(self.tasks)}
@@ -179,24 +194,6 @@ class Dataset:
                         key, _, name = column.removeprefix("stats/").rpartition("/")
                         found.setdefault(key, {})[name] = np.array(value)
                 self._stats = joined(self._stats, found)
-
-    def _tasks_table(self) -> Any:
-        """Make the table of tasks in the format that LeRobot reads: that of a pandas frame indexed by task."""
-        pa, name = self._pa, "__index_level_0__"
-        text: dict[str, Any] = {"pandas_type": "unicode", "numpy_type": "object"}
-        columns: list[dict[str, Any]] = [
-            {"name": "task_index", "field_name": "task_index", "pandas_type": "int64", "numpy_type": "int64"},
-            {"name": None, "field_name": name, **text},
-        ]
-        pandas = {
-            "index_columns": [name],
-            "column_indexes": [{"name": None, "field_name": None, **text, "metadata": {"encoding": "UTF-8"}}],
-            "columns": [{**column, "metadata": None} for column in columns],
-            "creator": {"library": "pyarrow", "version": pa.__version__},
-            "pandas_version": "2.2.0",
-        }
-        table = pa.table({"task_index": pa.array(range(len(self.tasks)), pa.int64()), name: pa.array(self.tasks)})
-        return table.replace_schema_metadata({"pandas": json.dumps(pandas)})
 
     def _parquet(self, table: Any, name: str) -> None:
         part = self._part(name)

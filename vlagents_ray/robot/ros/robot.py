@@ -1,4 +1,4 @@
-"""A robot behind topics of ROS 2, which are parts of the observation and of the action, and the file of these topics."""
+"""A robot behind topics of ROS 2, the parts of its observation and its action, and the file that names the topics."""
 
 from __future__ import annotations
 
