@@ -16,7 +16,7 @@ from typing import Any, Literal, get_args
 import numpy as np
 
 from vlagents_ray.bench.line_process import LineProcess, ProcessFailed, our_environment
-from vlagents_ray.bench.tuning_process import FRAMES, ProcessSettings, save_observations
+from vlagents_ray.bench.measured_policy import FRAMES, ProcessSettings, save_observations
 from vlagents_ray.errors import ConfigError, VLAgentsError
 from vlagents_ray.evaluate.artifacts.recorder import Trajectory, videos_of
 from vlagents_ray.interface import Obs
@@ -288,7 +288,7 @@ class Tuner:
             dims=self._plan.dims,
         )
         found = our_environment() if environment.python is None else {}
-        command = [environment.python or sys.executable, "-m", "vlagents_ray.bench.tuning_process"]
+        command = [environment.python or sys.executable, "-m", "vlagents_ray.bench.measured_policy"]
         with LineProcess("tune", command, found | environment.env_vars, end_s=_END_S) as process:
             process.send(json.dumps(asdict(settings)))
             said = self._answer(process)
