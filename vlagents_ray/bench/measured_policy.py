@@ -1,10 +1,9 @@
 """A policy in this process, behind a replica's batch queue, with timed calls; without Ray.
 
-`python -m vlagents_ray.bench.measured_policy` is the process of `tuner` with one variant of a policy, which it loads and
-measures. It runs in the policy's own Python environment, and so needs the light install and pydantic. The first line of
-its input is `ProcessSettings`, as JSON. Each further line is a request, {"measure": SESSIONS, "seconds": S, "rank":
-RANK} or {"act": BATCH}, and is answered with a line of JSON. {"step": …} is a step of a long load, {"failed": …} an
-error.
+`python -m vlagents_ray.bench.measured_policy` is a process of `tuner`, which loads and measures one variant of a policy.
+It runs in the policy's own Python environment, and so needs the light install and pydantic. The first line of its input
+is `ProcessSettings`, as JSON. Each further line is a request, {"measure": SESSIONS, "seconds": S, "rank": RANK} or
+{"act": BATCH}, and is answered with a line of JSON. {"step": …} is a step of a long load, {"failed": …} an error.
 """
 
 from __future__ import annotations
