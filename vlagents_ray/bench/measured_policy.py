@@ -1,9 +1,9 @@
 """A policy in this process, behind a replica's batch queue, with timed calls; without Ray.
 
-`python -m vlagents_ray.bench.measured_policy` is a process of `tuner`, which loads and measures one variant of a policy.
-It runs in the policy's own Python environment, and so needs the light install and pydantic. The first line of its input
-is `ProcessSettings`, as JSON. Each further line is a request, {"measure": SESSIONS, "seconds": S, "rank": RANK} or
-{"act": BATCH}, and is answered with a line of JSON. {"step": …} is a step of a long load, {"failed": …} an error.
+`python -m vlagents_ray.bench.measured_policy` loads and measures one variant of a policy for `tuner`. It runs in the
+policy's own Python environment, and so needs the light install and pydantic. The first line of its input is
+`ProcessSettings`, as JSON. Each further line is a request, {"measure": SESSIONS, "seconds": S, "rank": RANK} or {"act":
+BATCH}, and is answered with a line of JSON. {"step": …} is a step of a long load, {"failed": …} an error.
 """
 
 from __future__ import annotations
@@ -257,9 +257,17 @@ def main() -> None:
 
 def _serve(settings: ProcessSettings, answer: Callable[[Mapping[str, Any]], None]) -> None:
     agent: Agent = build_agent(settings.policy, settings.config, settings.wrappers)
+    recorded = [] if settings.frames is None else load_observations(Path(settings.frames))
+
+    def view(contract: Contract | None, i: int) -> Obs:
+        if not recorded:
+            return random_observation(contract, i, side=settings.side, dims=settings.dims)
+        check_observation(recorded[i % len(recorded)], contract)
+        return recorded[i % len(recorded)]
+
     measured = MeasuredPolicy(
         agent,
-        _views(settings),
+        view,
         max_size=settings.max_size,
         patience=settings.patience,
         batch_sizes=settings.batch_sizes,
@@ -293,19 +301,6 @@ def _serve(settings: ProcessSettings, answer: Callable[[Mapping[str, Any]], None
             except Exception as error:  # noqa: BLE001 - as above; smaller batches may still work
                 said = {"failed": _sentence(error)}
             answer(said)
-
-
-def _views(settings: ProcessSettings) -> Callable[[Contract | None, int], Obs]:
-    if settings.frames is None:
-        return lambda contract, i: random_observation(contract, i, side=settings.side, dims=settings.dims)
-    recorded = load_observations(Path(settings.frames))
-
-    def view(contract: Contract | None, i: int) -> Obs:
-        obs = recorded[i % len(recorded)]
-        check_observation(obs, contract)
-        return obs
-
-    return view
 
 
 def _sentence(error: BaseException) -> str:
