@@ -189,9 +189,7 @@ def angles_in(part: str, unit: str | None, dim: int) -> range:
         return range(0)
     if unit == "rad":
         return range(dim)
-    if unit == "m+rad" and dim == 6:  # x, y, z, roll, pitch, yaw
-        return range(3, 6)
-    return range(0)
+    return range(3, 6) if unit == "m+rad" and dim == 6 else range(0)  # x, y, z, roll, pitch, yaw
 
 
 def rotation_vector_in(part: str, unit: str | None, dim: int) -> int | None:

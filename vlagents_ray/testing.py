@@ -104,9 +104,7 @@ def _plain(value: object) -> object:
         return {part.name: getattr(value, part.name) for part in fields(value)}
     if hasattr(value, "__array__") and not isinstance(value, (np.ndarray, np.generic)):
         return np.asarray(value.float() if "bfloat16" in str(getattr(value, "dtype", "")) else value)  # type: ignore[attr-defined]
-    if type(value).__eq__ is object.__eq__ and hasattr(value, "__dict__"):
-        return vars(value)
-    return value
+    return vars(value) if type(value).__eq__ is object.__eq__ and hasattr(value, "__dict__") else value
 
 
 def _array_difference(a: np.ndarray, b: np.ndarray, where: str, atol: float) -> str | None:
@@ -122,8 +120,7 @@ def _array_difference(a: np.ndarray, b: np.ndarray, where: str, atol: float) -> 
 
 def require_same(a: Any, b: Any, where: str, because: str, atol: float = 0.0) -> None:
     """Raise `ContractViolation` with the difference and the reason `because` unless two values are equal."""
-    found = difference(a, b, where, atol)
-    if found:
+    if found := difference(a, b, where, atol):
         raise ContractViolation(f"{found}; {because}")
 
 

@@ -86,6 +86,4 @@ def _finite(array: np.ndarray) -> bool:
 
 
 def _describe(value: object) -> str:
-    if isinstance(value, np.ndarray):
-        return f"{value.shape} {value.dtype}"
-    return type(value).__name__
+    return f"{value.shape} {value.dtype}" if isinstance(value, np.ndarray) else type(value).__name__

@@ -196,9 +196,7 @@ def device_name() -> str:
     """Return the name of the policy's accelerator, or "cpu"."""
     if (used := cuda()) is not None:
         return str(used.get_device_name())
-    if (device := jax_device()) is not None:
-        return str(device.device_kind)
-    return "cpu"
+    return "cpu" if (device := jax_device()) is None else str(device.device_kind)
 
 
 @dataclass(frozen=True, slots=True)

@@ -131,8 +131,7 @@ class ChunkBuffer:
 
     def take(self) -> Step:
         """Return `next` and count it as executed; raises `PolicyFailed` if no chunk reaches that far."""
-        step = self.next
-        if step is None:
+        if (step := self.next) is None:
             raise PolicyFailed(f"chunk: no row is left for step {self.executed} of the plan")
         self.advance()
         return step

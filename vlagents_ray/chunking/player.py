@@ -298,8 +298,7 @@ class ChunkPlayer(Agent):
 
     def act(self, obs: Obs) -> Act:
         """Return the action of this tick, (D,) float32."""
-        tick = self._tick
-        if tick is None:
+        if (tick := self._tick) is None:
             raise NotReset("act before reset; reset first")
         begun = time.monotonic()
         self._motion.tick()

@@ -287,8 +287,7 @@ DELTA_POSE = ActionSpec(
 
 def require_cameras(env: str, names: Collection[str], have: Collection[str]) -> None:
     """Raise `ConfigError` unless an env has the cameras of these names."""
-    unknown = sorted(set(names) - set(have))
-    if unknown:
+    if unknown := sorted(set(names) - set(have)):
         raise ConfigError(f"{env} has no camera {unknown}: want some of {sorted(have)}")
 
 

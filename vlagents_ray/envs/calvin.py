@@ -312,8 +312,7 @@ def find_checkout(chosen: str | None) -> Path:
     if not named:
         raise ConfigError(f"calvin: {VARIABLE} is not set; {_CURE}")
     checkout = Path(named).expanduser().resolve()
-    lacks = [str(part) for part in (_CONF, _TASKS, _WORDS) if not (checkout / part).exists()]
-    if lacks:
+    if lacks := [str(part) for part in (_CONF, _TASKS, _WORDS) if not (checkout / part).exists()]:
         raise ConfigError(f"calvin: {checkout} lacks {lacks}, want a checkout of CALVIN with its submodules; {_CURE}")
     return checkout
 

@@ -360,8 +360,7 @@ class Pick:
     @classmethod
     def parse(cls, text: str) -> Pick:
         """Parse a path: `"images/top"`, `"agent_pos"`, `"robot/qpos[0:7]"`, `"[2:]"`; `""` is the whole observation."""
-        match = _PATH.fullmatch(text)
-        if match is None:
+        if (match := _PATH.fullmatch(text)) is None:
             raise ConfigError(f"path {text!r}: want keys joined by '/', then perhaps a range, as in 'robot/qpos[0:7]'")
         start, stop = (int(match[name]) if match[name] else None for name in ("start", "stop"))
         return cls(text, tuple(key for key in match["keys"].split("/") if key), slice(start, stop))
@@ -417,9 +416,7 @@ def plain(value: Any) -> Any:
     if isinstance(value, Mapping):
         converted = {str(key): plain(item) for key, item in value.items()}
         return {key: item for key, item in converted.items() if item is not None}
-    if isinstance(value, (list, tuple)):
-        return [plain(item) for item in value]
-    return None
+    return [plain(item) for item in value] if isinstance(value, (list, tuple)) else None
 
 
 def bounds(space: Any) -> tuple[np.ndarray, np.ndarray, np.dtype[Any]]:

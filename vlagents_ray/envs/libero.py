@@ -532,7 +532,6 @@ def find_assets(chosen: str | None = None) -> Path:
     if folder is None:
         looked = " and ".join(str(place or f"the packages {_PACKAGED}") for place in places)
         raise EnvFailed(f"libero: no assets (meshes and textures) in {looked}; {CURE}")
-    lacks = [part for part in _NEEDED if not (folder / part).is_dir()]
-    if lacks:
+    if lacks := [part for part in _NEEDED if not (folder / part).is_dir()]:
         raise EnvFailed(f"libero: the assets in {folder} lack {lacks}; {CURE}")
     return folder.resolve()

@@ -30,9 +30,7 @@ def node_of_this_process() -> Any:
     second cluster.
     """
     worker: Any = sys.modules.get("ray._private.worker")
-    if worker is None or not worker.global_worker.connected:
-        return None
-    return worker.global_worker.node
+    return None if worker is None or not worker.global_worker.connected else worker.global_worker.node
 
 
 def use_loopback(on: bool) -> bool:

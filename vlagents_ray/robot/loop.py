@@ -305,9 +305,8 @@ class _Run:
         held, why, safe = self.control.hold(), getattr(self.robot, "holds", None), _safe(act)
         if held is None and why is not None:
             return Held("robot", str(why))
-        if held is None and safe is not None and safe.cause in ("stopped", "paused"):
-            return safe  # its cause ended after the player's decision
-        return held
+        # The cause of a safe action may have ended after the player's decision.
+        return safe if held is None and safe is not None and safe.cause in ("stopped", "paused") else held
 
     def _stop(self, why: Held) -> None:
         """Command nothing at this tick."""

@@ -77,16 +77,14 @@ def split(words: Sequence[str], known: Mapping[str, bool]) -> tuple[list[str], d
 
 
 def _next(words: Iterable[str], option: str) -> str:
-    value = next(iter(words), None)
-    if value is None:
+    if (value := next(iter(words), None)) is None:
         raise ConfigError(f"{option}: got no value; want {option}=VALUE")
     return value
 
 
 def first_index(array: str) -> str:
     """Return the first task of an `--array`: 4 of "4-9%2"."""
-    found = re.match(r"\d+", array)
-    if found is None:
+    if (found := re.match(r"\d+", array)) is None:
         raise ConfigError(f"--array: got {array!r}, want numbers, as in 0-15, 1,3,7 or 0-99%4")
     return found[0]
 

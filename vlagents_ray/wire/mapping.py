@@ -152,9 +152,7 @@ def stated(value: Any) -> Any:
     """Return `value` as plain JSON values, without fields that are None."""
     if isinstance(value, dict):
         return {name: stated(item) for name, item in value.items() if item is not None}
-    if isinstance(value, (list, tuple)):
-        return [stated(item) for item in value]
-    return value
+    return [stated(item) for item in value] if isinstance(value, (list, tuple)) else value
 
 
 # Paths into nested observations, such as `images/wrist`: either that key itself, or `wrist` within `images`.

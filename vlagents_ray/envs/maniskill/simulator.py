@@ -65,8 +65,7 @@ def step_limits(env: str, task: str, wanted: int | None) -> tuple[int, int | Non
     if task not in registered:
         raise UnknownEnv(f"maniskill has no task {task!r}: want one of {sorted(INSTRUCTIONS)}, or another of its ids")
     own: int | None = registered[task].max_episode_steps
-    limit = own if wanted is None else wanted
-    if limit is None:
+    if (limit := own if wanted is None else wanted) is None:
         raise ConfigError(f"{env} has no step limit of its own; set max_steps")
     require_sizes(env, max_steps=limit)
     return limit, own

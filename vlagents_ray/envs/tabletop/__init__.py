@@ -159,8 +159,7 @@ class Tabletop(EvalEnv):
 
         `info["instructions"]` lists the instructions of the episode's task that are possible in this scene.
         """
-        unknown = sorted(set(options or {}) - {"instruction"})
-        if unknown:
+        if unknown := sorted(set(options or {}) - {"instruction"}):
             raise ConfigError(f"tabletop: unknown reset options {unknown}, want none or 'instruction'")
         rng = np.random.default_rng(seed % 2**64)  # numpy accepts no negative seed
         task = self._tasks[rng.integers(len(_TASKS)) if self._task == MIXED else 0]
