@@ -227,8 +227,7 @@ def centre_of(episodes: Sequence[np.ndarray]) -> float | None:
     circle = np.sort(values)
     arcs = np.diff(circle, append=circle[0] + _TURN)
     widest = int(arcs.argmax())
-    opposite = circle[widest] + arcs[widest] / 2 + math.pi
-    return round(float(_near(np.array(opposite), 0.0)), 6)
+    return round(float(_near(np.array(circle[widest] + arcs[widest] / 2 + math.pi), 0.0)), 6)
 
 
 def rotation_centre_of(episodes: Sequence[np.ndarray]) -> tuple[float, float, float] | None:

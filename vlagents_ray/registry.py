@@ -333,8 +333,7 @@ def names(kind: str) -> dict[str, str]:
     """Return all names of `kind` ("policies", "wrappers", "envs" or "dialects") with their "module:Class"."""
     adapters = {"policies": POLICIES, "envs": ENVS}.get(kind, {})
     own = DIALECTS if kind == "dialects" else {name: one.target for name, one in adapters.items()}
-    found = {point.name: point.value for point in entry_points(group=f"vlagents_ray.{kind}")}
-    return found | own
+    return {point.name: point.value for point in entry_points(group=f"vlagents_ray.{kind}")} | own
 
 
 def policy_class(name: str) -> type[Any]:
@@ -374,8 +373,7 @@ def _is_class(name: str) -> bool:
 
 def named_class(name: str, known: dict[str, str], unknown: type[ConfigError] = ConfigError) -> type[Any]:
     """Return the class named `name` in `known`, or given as "module:Class"; raises `unknown` if there is none."""
-    target = known.get(name, name)
-    module, colon, attribute = target.partition(":")
+    module, colon, attribute = known.get(name, name).partition(":")
     if not colon:
         raise unknown(
             f"{name!r} is not registered: want one of {sorted(known)}, or 'module:Class'{did_you_mean(name, known)}"

@@ -443,8 +443,7 @@ class _EnvSuite:
         spec = self._contract.action
         low = -1.0 if spec.low is None else spec.low
         high = 1.0 if spec.high is None else spec.high
-        actions = np.random.default_rng(0).uniform(low, high, (count, spec.dim or 1))
-        return list(actions.astype(np.float32))
+        return list(np.random.default_rng(0).uniform(low, high, (count, spec.dim or 1)).astype(np.float32))
 
     def play(self, seed: int, actions: list[np.ndarray]) -> _Rollout:
         obs = self.reset(seed)

@@ -354,8 +354,7 @@ class Tuner:
 
     def _actions(self, process: LineProcess, size: int) -> list[np.ndarray]:
         process.send(json.dumps({"act": size}))
-        said = self._answer(process)
-        return [np.array(action, np.float64) for action in said["actions"]]
+        return [np.array(action, np.float64) for action in self._answer(process)["actions"]]
 
     def _turn(self, process: LineProcess, number: int) -> dict[str, Any]:
         rank = "robot" if self._plan.goal.kind == "robots" else "simulation"

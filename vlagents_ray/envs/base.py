@@ -381,8 +381,7 @@ class SequentialBatch(BatchEnv):
         return self._envs[0].renderer()
 
     def describe(self) -> dict[str, Any]:
-        several = {} if self.num_envs == 1 else {"num_envs": self.num_envs}
-        return {**self._envs[0].describe(), **several}
+        return self._envs[0].describe() | ({} if self.num_envs == 1 else {"num_envs": self.num_envs})
 
     def close(self) -> None:
         with ExitStack() as closing:

@@ -269,8 +269,7 @@ def http_options() -> Any:
 def replica_is_ending() -> bool:
     """Return whether Serve has begun to stop the replica in this process; Serve has no public hook for that."""
     worker = _worker()
-    actor = worker.actors.get(worker.actor_id)
-    return bool(actor._replica_impl._shutting_down)
+    return bool(worker.actors.get(worker.actor_id)._replica_impl._shutting_down)
 
 
 def replica_request(request_id: str, method: str) -> bytes:

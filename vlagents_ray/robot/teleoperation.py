@@ -128,8 +128,7 @@ class AxesLeader:
             self._closed = obs.gripper is not None and obs.gripper < _FULLY_OPEN
         if self._device.gripper_presses() % 2:
             self._closed = not self._closed
-        command = self._spec.gripper_closed if self._closed else self._spec.gripper_open
-        return float(command or 0.0)
+        return float((self._spec.gripper_closed if self._closed else self._spec.gripper_open) or 0.0)
 
 
 # A keyboard as a device with axes, read from the terminal so that it also works over SSH.

@@ -149,8 +149,7 @@ class _GpuMemory:
         if torch is None or type(value) not in (torch.Tensor, torch.nn.Parameter):
             return ""
         # An empty tensor has no memory, and a sparse one has several.
-        on_gpu = value.is_cuda and value.layout == torch.strided and value.numel()
-        return self._uuid(value.device) if on_gpu else ""
+        return self._uuid(value.device) if value.is_cuda and value.layout == torch.strided and value.numel() else ""
 
     def finish(self, device: Any) -> None:
         """Wait for the work that this thread has queued on a GPU, since another process does not wait for it.

@@ -493,8 +493,7 @@ class KeyMapping:
         """Raise if `obs` has nothing of the client's observation, or none of its cameras or none of its states."""
         images = [camera.key for camera in self.cameras.values()]
         numbers = [part.key for sources in self.state.values() for part in sources]
-        grippers = [] if self.gripper is None else [self.gripper.key]
-        known = [*images, *numbers, *grippers]
+        known = [*images, *numbers, *([] if self.gripper is None else [self.gripper.key])]
         if known and not obs.cameras and not obs.state and obs.gripper is None:
             raise InvalidObservation(
                 f"observation: got {keys(flat)}, of which the mapping reads nothing; it looks for {known}: "

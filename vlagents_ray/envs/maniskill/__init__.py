@@ -138,8 +138,7 @@ class ManiSkill(SimulatorEnv):
         return _described(self._alive(), self._reconfigure, self.max_steps, self._own_limit)
 
     def _begin(self, seed: int, state: int) -> tuple[Obs, dict[str, Any]]:
-        rebuild = {"reconfigure": True} if self._reconfigure else {}
-        now = self._env.reset([seed], {**self._options, **rebuild})
+        now = self._env.reset([seed], {**self._options, **({"reconfigure": True} if self._reconfigure else {})})
         return now.obs[0], {"success": now.success[0]}
 
     def _advance(self, action: np.ndarray) -> tuple[Obs, float, bool, dict[str, Any]]:
@@ -240,5 +239,4 @@ def _described(simulator: Simulator, reconfigure: bool, max_steps: int, own_limi
         deviations.append("reconfigure is False: scenes are kept from episode to episode")
     if max_steps != own_limit:
         deviations.append(f"max_steps is {max_steps}, the task's own is {own_limit}")
-    protocol = {**PROTOCOL, "deviations": deviations}
-    return {**simulator.describe(), "reconfigure": reconfigure, "protocol": protocol}
+    return simulator.describe() | {"reconfigure": reconfigure, "protocol": {**PROTOCOL, "deviations": deviations}}

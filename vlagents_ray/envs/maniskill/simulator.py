@@ -189,8 +189,7 @@ class ManiSkillRobot:
 
     def __init__(self, agent: Any) -> None:
         names = [joint.name for joint in agent.robot.active_joints]
-        arm = getattr(agent, "arm_joint_names", names)
-        self._arm = np.array([names.index(name) for name in arm])
+        self._arm = np.array([names.index(name) for name in getattr(agent, "arm_joint_names", names)])
         self._finger_m = _FINGER_M.get(agent.uid)
         self.has_gripper = self._finger_m is not None
         self._fingers = np.array([names.index(name) for name in getattr(agent, "gripper_joint_names", ())], dtype=int)
@@ -219,8 +218,7 @@ class ManiSkillRobot:
         if self._finger_m is None:
             return None
         closed, opened = self._finger_m
-        opening = (float(qpos[self._fingers].mean()) - closed) / (opened - closed)
-        return min(max(opening, 0.0), 1.0)
+        return min(max((float(qpos[self._fingers].mean()) - closed) / (opened - closed), 0.0), 1.0)
 
 
 def _tool(agent: Any) -> Any:
@@ -394,8 +392,7 @@ class Simulator:
         for i, (state, gripper) in enumerate(self._robot.read(env.agent)):
             extra = {} if states is None else {"sim_state": states[i]}
             seen.append(Obs({name: rows[i] for name, rows in images.items()}, gripper, state, extra))
-        success = [bool(value) for value in info["success"]]
-        return Moment(seen, success, [0.0] * len(seen))
+        return Moment(seen, [bool(value) for value in info["success"]], [0.0] * len(seen))
 
     def renderer(self) -> Renderer | None:
         found = vulkan_device(on_gpu=self.alive().backend.render_device.is_cuda())

@@ -162,8 +162,7 @@ class TabletopRenderer:
             canvas.paint(
                 np.asarray(_FINGER) * 0.72, canvas.box(u, -length / 2, finger, length / 2 + finger / 2, finger / 2)
             )
-            lit = canvas.box(u - finger * 0.25, -length / 2, finger * 0.6, length / 2, finger / 2)
-            canvas.paint(_FINGER, lit)
+            canvas.paint(_FINGER, canvas.box(u - finger * 0.25, -length / 2, finger * 0.6, length / 2, finger / 2))
         canvas.paint(_PALM_FRONT, canvas.box(0, above + front / 2, half, tall * self._up + front / 2, 0.008 * s))
         canvas.paint(_PALM, canvas.box(0, above, half, tall * self._up, 0.008 * s))
         canvas.paint((48, 49, 51), 0.6 * canvas.glow(0, above, 0.03 * s, 0.024 * s))

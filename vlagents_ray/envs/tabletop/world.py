@@ -131,8 +131,7 @@ class TabletopWorld:
     def _raise(self, dz: float) -> None:
         z = _clip(self.z + dz, REACH[2])
         if self.held is not None:
-            under = self._support(self.held)
-            z = max(z, self.z + under - self.held.z)
+            z = max(z, self.z + self._support(self.held) - self.held.z)
         elif dz < 0:
             for puck in self.pucks:
                 top = puck.z + PUCK_HEIGHT

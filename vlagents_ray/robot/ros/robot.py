@@ -310,8 +310,7 @@ class RosRobot:
         self.watchdog: Watchdog | None = None
         """The watchdog of the control loop, with `silent_s` among its sources."""
         self._link: Link = link or (Ros2() if settings.link == ROS2 else Rosbridge(settings.link))
-        by_stamp = settings.clock == "stamp"
-        self._readers = {id(reading): TopicReader(reading, by_stamp) for reading in settings.sensors}
+        self._readers = {id(one): TopicReader(one, settings.clock == "stamp") for one in settings.sensors}
         self._beat_at = -math.inf
         self._connections = 0
         self._lost_at = -math.inf  # s of `time.monotonic`
