@@ -330,23 +330,24 @@ class ChunkPlayer(Agent):
 
     def _ask(self, obs: Obs, tick: int, begun: float) -> None:
         """Take the policy's answer, send the next request if it is due, and wait as long as allowed and needed."""
-        if self._asker is None or self.settings.deadline_s is None:
+        asker = self._asker
+        if asker is None or self.settings.deadline_s is None:
             if self._wants(tick, obs):
                 self._note_asked(tick, obs)
                 self._take(self._agent.act(stamped(obs, self._extras())), tick)
         else:  # no tick waits for an action that will not be executed
             deadline = begun + (self.settings.deadline_s if self.control.state == "autonomous" else 0.0)
-            self._receive(self._asker.take(), tick)
-            if self._asker.idle and self._wants(tick, obs):
+            self._receive(asker.take(), tick)
+            if asker.idle and self._wants(tick, obs):
                 self._note_asked(tick, obs)
                 if self._waiting_since is None:
                     self._waiting_since = time.monotonic()
-                self._asker.ask(stamped(copied(obs), self._extras()))
-            while not self._asker.idle and (left_s := deadline - time.monotonic()) > 0:
+                asker.ask(stamped(copied(obs), self._extras()))
+            while not asker.idle and (left_s := deadline - time.monotonic()) > 0:
                 fresh = self.settings.mode != "async" and self._request.tick == tick
                 if not fresh and self._next() is not None:
                     break
-                self._receive(self._asker.take(left_s), tick)
+                self._receive(asker.take(left_s), tick)
 
     def _choose_safe(self) -> None:
         """Choose the safe action; raises `ConfigError` if it does not fit the policy's actions."""
