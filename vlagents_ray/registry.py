@@ -333,7 +333,8 @@ def names(kind: str) -> dict[str, str]:
     """Return all names of `kind` ("policies", "wrappers", "envs" or "dialects") with their "module:Class"."""
     adapters = {"policies": POLICIES, "envs": ENVS}.get(kind, {})
     own = DIALECTS if kind == "dialects" else {name: one.target for name, one in adapters.items()}
-    return {point.name: point.value for point in entry_points(group=f"vlagents_ray.{kind}")} | own
+    found = {point.name: point.value for point in entry_points(group=f"vlagents_ray.{kind}")}
+    return found | own
 
 
 def policy_class(name: str) -> type[Any]:
