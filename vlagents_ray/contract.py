@@ -124,11 +124,11 @@ def _names(value: object, where: str) -> tuple[str, ...] | None:
 
 def differences(policy: Contract, env: Contract) -> list[str]:
     """List the differences between the contracts of a policy and an env, one sentence each with its cure."""
-    found = []
-    for name, need in (policy.cameras or {}).items() if env.cameras is not None else ():
-        if (have := (env.cameras or {}).get(name)) is None:
+    found, given = [], env.cameras or {}
+    for name, need in ((policy.cameras or {}) if env.cameras is not None else {}).items():
+        if (have := given.get(name)) is None:
             found.append(
-                f"camera {name!r}: the policy needs it, the env gives {sorted(env.cameras or ())}; "
+                f"camera {name!r}: the policy needs it, the env gives {sorted(given)}; "
                 f"add or rename a camera of the env"
             )
         elif _differ(need.height, have.height) or _differ(need.width, have.width):

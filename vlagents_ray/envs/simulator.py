@@ -116,11 +116,11 @@ class SimulatorEnv(EvalEnv):
         seed selects. There are no other options.
         """
         self._alive()
-        options, count = options or {}, self.init_states
-        if unknown := sorted(set(options) - ({"init_state"} if count is not None else set())):
+        given, count = options or {}, self.init_states
+        if unknown := sorted(set(given) - ({"init_state"} if count is not None else set())):
             want = "none" if count is None else "init_state or none"
             raise ConfigError(f"{self._name}: unknown reset options {unknown}, want {want}")
-        state = options.get("init_state", seed % (count or 1))
+        state = given.get("init_state", seed % (count or 1))
         if type(state) is not int or not 0 <= state < (count or 1):
             raise ConfigError(f"{self._name}: init_state is {state!r}, want 0 to {(count or 1) - 1}")
         with failing(self._name, "reset"):
