@@ -36,7 +36,7 @@ from vlagents_ray.errors import ConfigError
 from vlagents_ray.interface import Act, Agent, Obs
 from vlagents_ray.policies.wrapper import build_agent
 from vlagents_ray.serve.config.deployment import ServerArgs
-from vlagents_ray.testing.agents import random_observation
+from vlagents_ray.testing import random_observation
 
 
 @dataclass(frozen=True, slots=True)
