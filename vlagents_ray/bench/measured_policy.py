@@ -24,7 +24,7 @@ from typing_extensions import Self
 from vlagents_ray.bench.line_client import die_with_parent, own_stdout
 from vlagents_ray.contract import Contract
 from vlagents_ray.errors import PolicyFailed
-from vlagents_ray.interface import Agent, Obs
+from vlagents_ray.interface import Act, Agent, Obs
 from vlagents_ray.policies.wrapper import Wrapper, build_agent
 from vlagents_ray.protocol.messages import RankName, Reply, Request
 from vlagents_ray.serve.engine.engine import Engine
@@ -97,15 +97,25 @@ class MeasuredPolicy:
         found: list[np.ndarray] = []
         while len(found) < count:
             episodes = [i % count for i in range(len(found), len(found) + size)]
-            views = [self._view(self.engine.contract, i) for i in episodes]
-            sessions = [self._copies.make() for _ in episodes]
-            for session, view, i in zip(sessions, views, episodes, strict=True):
-                session.reset(view, INSTRUCTION, seed=i)
-            for act in self.agent.act_batch(views, sessions):
-                if isinstance(act, Exception):
-                    raise act
-                found.append(act.action)
+            found += [act.action for act in self.batch(episodes)()]
         return found
+
+    def batch(self, episodes: Sequence[int]) -> Callable[[], list[Act]]:
+        """Return a function that acts once with new sessions of these episodes, in one batch."""
+        views = [self._view(self.engine.contract, i) for i in episodes]
+        sessions = [self._copies.make() for _ in episodes]
+        for session, view, i in zip(sessions, views, episodes, strict=True):
+            session.reset(view, INSTRUCTION, seed=i)
+
+        def act() -> list[Act]:
+            found = []
+            for one in self.agent.act_batch(views, sessions):
+                if isinstance(one, Exception):
+                    raise one
+                found.append(one)
+            return found
+
+        return act
 
     def queued(self, size: int, seconds: float, rank: RankName) -> QueuedTurn:
         """Measure `size` sessions, each of which sends its next request as soon as the last one is answered."""

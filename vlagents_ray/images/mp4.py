@@ -21,7 +21,7 @@ def rgb_converter() -> Callable[[Any], np.ndarray]:
     It keeps its tables and threads, which a frame's own `to_ndarray` makes anew each time, in at least 0.25 ms.
     """
     reformat = require("av").video.reformatter.VideoReformatter().reformat
-    return lambda frame: reformat(frame, format="rgb24").to_ndarray()  # type: ignore[no-any-return]
+    return lambda frame: reformat(frame, format="rgb24").to_ndarray()
 
 
 class Mp4:
