@@ -54,7 +54,7 @@ def require_arguments(what: str, function: Callable[..., Any], given: Mapping[st
             continue
         default = parameter.default  # without an annotation, the default 1 allows 0.5 as well
         own = Any if default is None else float if type(default) is int else type(default)
-        annotation = annotations.get(name, own)
+        annotation: Any = annotations.get(name, own)
         kinds = list(get_args(annotation)) if get_origin(annotation) in (Union, UnionType) else [annotation]
         if not all(isinstance(kind, type) and kind in _PLAIN for kind in kinds):
             continue
