@@ -123,6 +123,10 @@ def ways() -> list[Way]:
         *(Way(f"upstream, {name}", upstream=name) for name in PROTOCOLS),
         Way(f"open loop, all {CHUNK} rows", execute=CHUNK),
         Way("ensemble", {"actions": "ensemble"}, execute=1),
+        *(
+            Way(f"stop and wait, {1000 * s:.0f} ms", clock=ClockConfig(latency=s, hz=HZ, meanwhile="zero"))
+            for s in DELAYS[1:]
+        ),
         *(Way(f"async, {1000 * s:.0f} ms", clock=ClockConfig(latency=s, hz=HZ)) for s in DELAYS),
         *(
             Way(f"real-time chunking, {1000 * s:.0f} ms", clock=ClockConfig(latency=s, hz=HZ, real_time_chunking=True))
