@@ -51,6 +51,11 @@ TOGETHER = 16  # episodes of a batch
 QUALITIES = (30, 50, 70, 85, 95)  # of JPEG; 85 is the client's
 DELAYS = (0.0, 0.05, 0.15)  # s
 HZ = 20.0  # of the clock at those delays: none, one and three ticks
+LATE: dict[str, dict[str, Any]] = {  # what is executed meanwhile: nothing, the old plan, or what the new one continues
+    "stop and wait": {"meanwhile": "zero"},
+    "async": {},
+    "real-time chunking": {"real_time_chunking": True},
+}
 _RAW = ImageCodec("raw")
 _ADAPTED = "context"  # the layer with an adapter of rank 4 of random weights, small enough that success remains
 _KEYS = {
@@ -124,12 +129,8 @@ def ways() -> list[Way]:
         Way(f"open loop, all {CHUNK} rows", execute=CHUNK),
         Way("ensemble", {"actions": "ensemble"}, execute=1),
         *(
-            Way(f"stop and wait, {1000 * s:.0f} ms", clock=ClockConfig(latency=s, hz=HZ, meanwhile="zero"))
-            for s in DELAYS[1:]
-        ),
-        *(Way(f"async, {1000 * s:.0f} ms", clock=ClockConfig(latency=s, hz=HZ)) for s in DELAYS),
-        *(
-            Way(f"real-time chunking, {1000 * s:.0f} ms", clock=ClockConfig(latency=s, hz=HZ, real_time_chunking=True))
+            Way(f"{name}, {1000 * s:.0f} ms", clock=ClockConfig(latency=s, hz=HZ, **settings))
+            for name, settings in LATE.items()
             for s in DELAYS
         ),
         Way("LoRA apart", adapter=True),

@@ -225,6 +225,7 @@ class ProcessSettings:
 
 
 def save_observations(observations: Sequence[Obs], file: Path) -> None:
+    """Write observations as an .npz, for `load_observations`."""
     arrays: dict[str, np.ndarray] = {}
     for number, obs in enumerate(observations):
         arrays |= {f"{number}/{_CAMERA}/{name}": image for name, image in obs.cameras.items()}

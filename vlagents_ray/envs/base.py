@@ -422,4 +422,5 @@ def episodes_of(seeds: Sequence[int], num_envs: int) -> int:
 
 
 def kind_of(answer: object) -> str:
+    """Return what an environment answered, for an error message."""
     return f"a tuple of {len(answer)}" if isinstance(answer, tuple) else type(answer).__name__

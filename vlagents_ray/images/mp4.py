@@ -18,7 +18,7 @@ from vlagents_ray.registry import require
 def rgb_converter() -> Callable[[Any], np.ndarray]:
     """Return what converts the decoded frames of one video to images, (H, W, 3) uint8 RGB.
 
-    It keeps its tables and threads, which a frame's own `to_ndarray` makes anew each time, in at least 0.25 ms.
+    It keeps its tables and threads, which the `to_ndarray` of a frame makes for that frame alone, in at least 0.25 ms.
     """
     reformat = require("av").video.reformatter.VideoReformatter().reformat
     return lambda frame: reformat(frame, format="rgb24").to_ndarray()
