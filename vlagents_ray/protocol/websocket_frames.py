@@ -32,10 +32,13 @@ class ReceiveBuffer(StreamReader):
 
     buffer: bytes | bytearray | memoryview  # type: ignore[assignment]
 
-    def __init__(self) -> None:
+    def __init__(self, limit: int) -> None:
+        """Create an empty buffer for messages of at most `limit` bytes."""
         super().__init__()
+        self._limit = limit
         self._start = 0  # start of the unparsed bytes in `buffer`
         self._between_frames = False  # whether the next byte begins a frame
+        self._fragments = False  # whether a frame was a part of a message: the parser then checks all that follow
 
     @property
     def size(self) -> int:
@@ -51,10 +54,11 @@ class ReceiveBuffer(StreamReader):
 
     def parse(self, data: bytes | memoryview) -> None:
         """Parse bytes of memory that is reused, and copy the rest after the last complete frame."""
-        if self._between_frames and (message := self._message(data)) is not None:
+        if self._between_frames and not self._fragments and (message := self._message(data)) is not None:
             self._protocol.events.append(Frame(Opcode.BINARY, message))
             return
         self._protocol.receive_data(data)  # type: ignore[arg-type]
+        self._fragments |= any(isinstance(event, Frame) and not event.fin for event in self._protocol.events)
         if isinstance(self.buffer, bytearray):
             del self.buffer[: self._start]
         else:
@@ -71,7 +75,7 @@ class ReceiveBuffer(StreamReader):
             at = 4 if size == 126 else 10
             size = int.from_bytes(data[2:at], "big")
         begin = at + 4 * masked
-        if len(data) != begin + size:
+        if len(data) != begin + size or size > self._limit:
             return None
         mask = bytes(data[at:begin])
         return frames.apply_mask(data[begin:], mask) if masked else bytes(data[begin:])  # type: ignore[attr-defined, no-any-return, unused-ignore]
@@ -102,7 +106,7 @@ class ReceiveBuffer(StreamReader):
                 return True
             self._between_frames = True
             yield
-        self._between_frames = False
+            self._between_frames = False
         return False
 
     def discard(self) -> None:

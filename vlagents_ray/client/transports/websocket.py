@@ -118,7 +118,7 @@ class Stream:
             max_size=DEFAULT_LIMITS.body_bytes,
             logger=WEBSOCKET_LOG,
         )
-        self._received = ReceiveBuffer()
+        self._received = ReceiveBuffer(DEFAULT_LIMITS.body_bytes)
         self._messages: list[bytes] = []
         # Fresh memory, which the kernel clears page by page, costs more than all other work on a frame with images.
         self._kept = bytearray(_KEPT_BYTES)

@@ -179,7 +179,7 @@ class WebSocketConnection(PolledConnection):
         self._protocol = ServerProtocol(max_size=messages.STREAM_BYTES)  # guarded by the lock
         self._head = b""  # received part of the handshake
         self._refused_for_s = 0.0  # time after which the handshake is no longer over the rate of its key
-        self._received = ReceiveBuffer()
+        self._received = ReceiveBuffer(messages.STREAM_BYTES)
         self._out = SendBuffer(connection, self._sending, messages.STREAM_BYTES)
         self._paused = False  # whether too many messages are unanswered; guarded by the lock
         # Received but unprocessed frames, their arrival times, s, and the admissions of those received in parts.
