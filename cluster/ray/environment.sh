@@ -43,8 +43,6 @@ export RAY_SERVE_HAPROXY_HEALTH_CHECK_INTER=1s
 export RAY_SERVE_HAPROXY_HEALTH_CHECK_FALL=3
 # s that a replica waits before it stops, for HAProxy to hear of it.
 export RAY_SERVE_DIRECT_INGRESS_MIN_DRAINING_PERIOD_S=1
-# A replica blocks no event loop: it needs none of its own, to which each request would change threads.
-export RAY_SERVE_RUN_USER_CODE_IN_SEPARATE_THREAD=0
 # Ray gives its workers a low priority; a policy is not to wait for whatever else the machine runs.
 export RAY_worker_niceness=0
 export RAY_USAGE_STATS_ENABLED=0

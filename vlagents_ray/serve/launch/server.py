@@ -334,12 +334,7 @@ def own_ray(
     with session.ray_folder() as folder, contextlib.ExitStack() as stack:
         # By default Ray starts workers with a low priority, so that a policy would wait for all other processes.
         # Proxies start while policies load: on a slow machine Serve would replace them after three times its 5 s.
-        # A replica blocks no event loop: it needs none of its own, to which each request would change threads.
-        environment = {
-            "RAY_worker_niceness": "0",
-            "RAY_SERVE_PROXY_READY_CHECK_TIMEOUT_S": "60",
-            "RAY_SERVE_RUN_USER_CODE_IN_SEPARATE_THREAD": "0",
-        }
+        environment = {"RAY_worker_niceness": "0", "RAY_SERVE_PROXY_READY_CHECK_TIMEOUT_S": "60"}
         # The address at which replicas listen for WebSockets: loopback if only TLS may cross the network.
         ours = {MARK: str(folder), session.ALONE: "0", HOST: host if tls is None else LOOPBACK}
         listener = None
