@@ -85,8 +85,11 @@ def test_who_does_not_know_the_path_is_not_let_in(endpoint: WebSocketServer) -> 
     wait_for(lambda: not endpoint._clients)
 
 
-def test_an_ordinary_websocket_client_is_served_too(endpoint: WebSocketServer) -> None:
-    with connect(f"ws://127.0.0.1:{endpoint.address.port}{endpoint.address.path}", compression=None) as socket_:
+@pytest.mark.parametrize("compression", [None, "deflate"])
+def test_an_ordinary_websocket_client_is_served_too(endpoint: WebSocketServer, compression: str | None) -> None:
+    url = f"ws://127.0.0.1:{endpoint.address.port}{endpoint.address.path}"
+    with connect(url, compression=compression) as socket_:
+        assert not socket_.protocol.extensions  # the server accepts no compression
         socket_.ping().wait(5)
         probe = bytes_probe(300_000)
         socket_.send(probe)
