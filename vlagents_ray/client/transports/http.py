@@ -132,9 +132,7 @@ class HttpTransport:
     ) -> tuple[int, str, bytes]:
         connection = self._open(timeout_s)
         try:
-            _cork(connection.sock, True)
             connection.request(method, self._url.path.rstrip("/") + path, body, headers | self._credentials.headers)
-            _cork(connection.sock, False)
             answer = connection.getresponse()
             content = answer.read(DEFAULT_LIMITS.body_bytes + 1)
             if len(content) > DEFAULT_LIMITS.body_bytes:
@@ -193,12 +191,6 @@ def _closed_by_peer(sock: socket.socket | None) -> bool:
     poller = select.poll()
     poller.register(sock, select.POLLIN)
     return bool(poller.poll(0))
-
-
-def _cork(sock: socket.socket, on: bool) -> None:
-    """Send no partial packets while `on`, so that the head and the body of a request arrive together, if possible."""
-    if hasattr(socket, "TCP_CORK"):
-        sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_CORK, on)
 
 
 def refusal(status: int, kind: str, body: bytes) -> VLAgentsError:
