@@ -19,6 +19,7 @@ Seconds = Annotated[float, typer.Option(min=0.1, help="Of each measurement.")]
 Rounds = Annotated[int, typer.Option(min=1)]
 Json = Annotated[Path | None, typer.Option("--json", help="Write the figures here.")]
 Transports = Annotated[str, typer.Option(help="shm,websocket,http,handle,plasma; default: all.")]
+_WITH_INTERVALS = 5  # ratios in a row that fit on a screen with their intervals; the file of figures has all
 
 
 def show_round_trips(found: Mapping[str, Any], title: str) -> None:
@@ -32,7 +33,8 @@ def show_round_trips(found: Mapping[str, Any], title: str) -> None:
         cells = []
         for name in theirs:
             one = ratios.get(name)
-            cells.append(f"{one['ratio']:.2f} ({one['ci95'][0]:.2f}-{one['ci95'][1]:.2f})" if one else "")
+            interval = f" ({one['ci95'][0]:.2f}-{one['ci95'][1]:.2f})" if one and len(theirs) <= _WITH_INTERVALS else ""
+            cells.append(f"{one['ratio']:.2f}{interval}" if one else "")
         rows.add_row(
             row["way"], f"{row['median_ms']:.3f}", f"{low:.3f} to {high:.3f}", f"{row['p99_ms']:.3f}", *cells,
             style="dim" if row["way"] in theirs else None,

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -18,18 +18,21 @@ from benchmarks import link
 from benchmarks.console import Calls
 from benchmarks.figures import measured_on
 from benchmarks.peers import PYTHON, PeersPython
+from benchmarks.picture import plot_league
 from benchmarks.rtt import measure_with_peers
-from benchmarks.throughput import ThroughputPlan, measure_throughput
+from benchmarks.throughput import WITHOUT_GAIN, ThroughputPlan, measure_throughput
 from vlagents_ray.cli.console import errors, out, progress, table
 from vlagents_ray.errors import ConfigError
 
 COMMAND = "python -m benchmarks.report"
 BEGIN, END = "<!-- bench -->", "<!-- /bench -->"
+PICTURE = Path("pictures", "league.svg")  # beside the page
 _MET = {True: "yes", False: "**no**", None: ""}
 Results = Mapping[str, Any]  # of `collect`
 
 ON_NODE = ("plasma, Ray actor", "shm, Ray actor")  # the faster one first
 DEFAULT, JPEG = "websocket, default", "websocket, jpeg"
+THROUGHPUTS = ("throughput", "without_gain")
 LIMIT_P99 = 3.0
 LIMIT_WAIT_MS = 72.0  # two full batches of 20 ms + 16 x 1 ms
 LIMIT_VLA_EVAL = 1.3
@@ -56,13 +59,17 @@ def collect(
     except ConfigError as error:
         progress(str(error))
         results["skipped"]["link"] = str(error)
-    results["throughput"] = measure_throughput(plan or ThroughputPlan(), progress)
+    plan = plan or ThroughputPlan(peers=["all"], peers_python=peers_python)
+    results["throughput"] = measure_throughput(plan, progress)
+    results["without_gain"] = measure_throughput(replace(plan, config=WITHOUT_GAIN, batch=1), progress)
     return results
 
 
 def write(results: Mapping[str, Any], page: Path, json_file: Path | None) -> None:
-    """Write the section into the page, and the figures for the next such section into `json_file`."""
+    """Write the section into the page, its picture beside it, and the figures into `json_file` for the next time."""
     text = replaced(page.read_text(), section(results))
+    if results.get("rtt"):
+        plot_league(results, page.parent / PICTURE)
     if json_file is not None:
         json_file.parent.mkdir(parents=True, exist_ok=True)
         json_file.write_text(json.dumps(results, indent=1) + "\n")
@@ -195,15 +202,14 @@ def replaced(text: str, section: str) -> str:
 def section(results: Mapping[str, Any]) -> str:
     """Return the text between the markers: targets, round trips, the link, throughput, and their origin."""
     parts = [_origin(results), _targets(outcomes(results))]
-    if rtt := results.get("rtt"):
-        parts.append(_round_trips("Round trips of one `act` on one machine", rtt))
+    if results.get("rtt"):
+        parts.append(_league(results))
     if link := results.get("link"):
         name = (
             f"The same over a link of {link['link']['measured_mbit_per_s']:.0f} Mbit/s between two network namespaces"
         )
         parts.append(_round_trips(name, link))
-    if throughput := results.get("throughput"):
-        parts.append(_throughput(throughput))
+    parts += [_throughput(results[name]) for name in THROUGHPUTS if results.get(name)]
     if skipped := list(_skipped(results)):
         parts.append("Not measured: " + "; ".join(skipped) + ".")
     return "\n\n".join(parts)
@@ -226,6 +232,52 @@ def _targets(lines: Sequence[Outcome]) -> str:
     )
 
 
+def _league(results: Results) -> str:
+    """Return the table of all systems: round trips, and the actions of the most clients by both policies."""
+    rtt = results["rtt"]
+    found = [{way["way"]: way for way in rows_of(results.get(name) or {})} for name in THROUGHPUTS]
+    theirs = {peer["way"] for peer in rtt["peers"]}
+    ways = sorted([*rtt["ways"], *rtt["peers"]], key=lambda one: float(one["median_ms"]))
+    rows = []
+    for way in ways:
+        name, (low, high) = way["way"], way["ci95_ms"]
+        row = [
+            f"*{name}*" if name in theirs else name,
+            f"{way['median_ms']:.3f} ({low:.3f} to {high:.3f})",
+            f"{way['p99_ms']:.2f}",
+            f"{way['median_ms'] / ways[0]['median_ms']:.3g}",
+        ]
+        for one in found:
+            row += [_rate(one[name]["curve"][-1]), _waits(one[name])] if name in one else ["", ""]
+        rows.append(row)
+    head = ["", "median ms", "p99 ms", "of the fastest"]
+    for name in THROUGHPUTS:
+        part = results.get(name) or {}
+        head += [f"actions/s, {_described(part)}", "a robot waits, p50 / p99 ms"] if part else ["", ""]
+    text = "Round trips of one `act` on one machine, and the actions a second of many clients"
+    return f"![{text}]({PICTURE})\n\n{text}; *other systems* run their own servers and clients:\n\n{_table(head, rows)}"
+
+
+def rows_of(part: Results) -> list[Results]:
+    """Return the rows of a measurement of throughput, ours and the peers', each with the name of its way."""
+    return [*part.get("transports", {}).values(), *({"way": n, **row} for n, row in part.get("peers", {}).items())]
+
+
+def _described(part: Results) -> str:
+    config = part["config"]
+    return f"{part['clients']} clients, {config['base_ms']:g} ms + {config['per_item_ms']:g} ms a row"
+
+
+def _rate(point: Results) -> str:
+    rate = f"{point['actions_per_s']:.0f}"
+    return rate if point.get("ci95") is None else "{} ({:.0f} to {:.0f})".format(rate, *point["ci95"])
+
+
+def _waits(row: Results) -> str:
+    robot = row["robot"]
+    return f"{robot['wait_p50_ms']:.1f} / {robot['wait_p99_ms']:.1f}" if robot else ""
+
+
 def _round_trips(title: str, part: Mapping[str, Any]) -> str:
     theirs = [peer["way"] for peer in part["peers"]]
     rows = []
@@ -244,26 +296,19 @@ def _round_trips(title: str, part: Mapping[str, Any]) -> str:
     return f"{title}:\n\n" + _table(("", "median ms", "p99 ms", *(f"/ {peer}" for peer in theirs)), rows)
 
 
-def _throughput(part: Mapping[str, Any]) -> str:
-    counts = [point["clients"] for row in part["transports"].values() for point in row["curve"]]
-    counts = list(dict.fromkeys(counts))
-    head = (
-        "",
-        f"of the ideal, {part['clients']} clients",
-        *(f"K = {k}" for k in counts),
-        "a robot waits, p50 / p99 ms",
-    )
+def _throughput(part: Results) -> str:
+    counts = list(dict.fromkeys(point["clients"] for row in rows_of(part) for point in row["curve"]))
+    head = ("", "of the ideal", *(f"K = {k}" for k in counts), "a robot waits, p50 / p99 ms")
     rows = []
-    for name, row in part["transports"].items():
-        curve = {point["clients"]: point for point in row["curve"]}
-        robot = row["robot"]
-        waits = f"{robot['wait_p50_ms']:.1f} / {robot['wait_p99_ms']:.1f}" if robot else ""
-        rates = [f"{curve[k]['actions_per_s']:.0f}" if k in curve else "" for k in counts]
-        rows.append((name, f"{row['of_ideal']:.3f}", *rates, waits))
+    for row in rows_of(part):
+        rates = {point["clients"]: _rate(point) for point in row["curve"]}
+        name = f"*{row['way']}*" if row["way"] in part.get("peers", {}) else row["way"]
+        rows.append((name, f"{row['of_ideal']:.3f}", *(rates.get(k, "") for k in counts), _waits(row)))
     what = f"`{part['policy']}`" + "".join(f", {key} {value}" for key, value in part["config"].items())
     text = (
         f"Actions a second of one replica by K clients ({what}, batches of {part['batch']} at most; ideal "
-        f"{part['ideal_actions_per_s']:.0f}, {part['ideal_is']}), and what a robot among simulations waits:"
+        f"{part['ideal_actions_per_s']:.0f}, {part['ideal_is']}), and what a robot among {part['clients'] - 1} "
+        f"simulations waits:"
     )
     return f"{text}\n\n{_table(head, rows)}"
 
@@ -272,7 +317,7 @@ def _skipped(results: Mapping[str, Any]) -> Iterator[str]:
     for name, reason in (results.get("skipped") or {}).items():
         yield f"{name} ({reason})"
     found: dict[str, str] = {}
-    for part in ("rtt", "link", "throughput", "evaluation"):
+    for part in ("rtt", "link", *THROUGHPUTS, "evaluation"):
         found |= (results.get(part) or {}).get("skipped", {})
     for name, reason in found.items():
         yield f"{name} ({reason})"
@@ -316,7 +361,8 @@ def main(
                 raise ConfigError(f"--json {json_file}: cannot be read ({error})") from error
         else:
             results = collect(
-                peers_python, calls=calls, link_calls=calls, plan=ThroughputPlan(seconds=seconds), progress=progress
+                peers_python, calls=calls, link_calls=calls, progress=progress,
+                plan=ThroughputPlan(seconds=seconds, peers=["all"], peers_python=peers_python),
             )  # fmt: skip
         write(results, page, None if from_json else json_file)
     out.print(f"wrote {page}")

@@ -24,20 +24,21 @@ import socket, sys
 sys.path.insert(0, {str(SCRIPTS)!r})
 import peer
 
-def serve(host, port):
+def serve(host, port, policy):
     with socket.create_server((host, port)) as server:
         while True:
             server.accept()[0].close()
 
-def drive(host, port, path, mode, out):
-    arrays = peer.observation(path)
+def connect(target):
     print("what libraries print")
-    shapes = {{name: array.shape for name, array in arrays.items()}}
-    if mode == "broken":
+    if target.mode == "broken":
         raise RuntimeError("no such model")
-    peer.obey(sys.stdin, out, lambda calls: peer.timed(int, int, calls), {{"shapes": shapes}})
+    assert {{name: array.shape for name, array in target.arrays.items()}} == {{
+        "camera_0": (224, 224, 3), "camera_1": (224, 224, 3), "joints": (7,), "gripper": ()
+    }}
+    return peer.Client(lambda: 3, lambda rows: target.policy(rows)[0])
 
-peer.run(serve, drive)
+peer.run(serve, connect)
 """
 PYTHON = Path(sys.executable)
 
@@ -64,17 +65,14 @@ def gone(pid: int) -> bool:
 
 
 def test_a_driver_gets_the_observation_and_makes_the_calls_it_is_told_to(fake: PeerClient, obs: Path) -> None:
-    with peer_connected(fake, PYTHON, obs) as driver:
-        said = driver.ready()
-        assert said["shapes"] == {
-            "camera_0": [224, 224, 3], "camera_1": [224, 224, 3], "joints": [7], "gripper": []
-        }  # fmt: skip
+    with peer_connected(fake, PYTHON, obs, {}) as driver:
+        driver.ready()
         assert len(driver.measure(25)) == 25
         assert all(ms >= 0 for ms in driver.measure(3))
 
 
 def test_server_and_driver_end_with_the_context(fake: PeerClient, obs: Path) -> None:
-    with peer_connected(fake, PYTHON, obs) as driver:
+    with peer_connected(fake, PYTHON, obs, {}) as driver:
         driver.ready()
         driver_pid = driver.pid  # type: ignore[attr-defined]
         running = subprocess.run(["pgrep", "-f", fake.script], capture_output=True, text=True, check=True)
@@ -87,7 +85,7 @@ def test_server_and_driver_end_with_the_context(fake: PeerClient, obs: Path) -> 
 def test_a_driver_that_breaks_tells_why(fake: PeerClient, obs: Path) -> None:
     broken = PeerClient("fake", "fake", fake.script, "broken", ())
     with (
-        peer_connected(broken, PYTHON, obs) as driver,
+        peer_connected(broken, PYTHON, obs, {}) as driver,
         pytest.raises(ProcessFailed, match=r"(?s)fake: ended with exit status 1.*no such model"),
     ):
         driver.ready()
@@ -97,7 +95,8 @@ def test_a_driver_that_breaks_tells_why(fake: PeerClient, obs: Path) -> None:
 def test_a_killed_bench_takes_its_processes_along(fake: PeerClient, obs: Path, command: str) -> None:
     """A driver waits on its input, a server serves; neither is told that the bench has died."""
     port = free_port()
-    words = [str(PYTHON), fake.script, command, "127.0.0.1", str(port), str(obs), "raw"]
+    words = [str(PYTHON), fake.script, command, "127.0.0.1", str(port)]
+    words += ["{}"] if command == "serve" else [str(obs), "raw", "{}"]
     code = (
         "import subprocess, sys, time\n"
         "p = subprocess.Popen(sys.argv[1:], stdin=subprocess.PIPE)\nprint(p.pid, flush=True)\ntime.sleep(60)"
