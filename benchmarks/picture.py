@@ -55,8 +55,8 @@ def _plot_throughput(axes: Any, part: Mapping[str, Any]) -> None:
         )  # fmt: skip
     axes.axhline(part["ideal_actions_per_s"], color=_TEXT, lw=0.8)
     axes.set_xscale("log", base=2)
-    config = part["config"]
-    axes.set_title(f"policy of {config['base_ms']:g} ms + {config['per_item_ms']:g} ms a row", fontsize=9)
+    settings = "".join(f", {key} {value}" for key, value in part["config"].items())
+    axes.set_title(f"{part['policy']}{settings}, batches of {part['batch']} at most", fontsize=9)
     axes.set_xlabel("clients")
     axes.set_ylabel("actions/s")
     axes.legend(fontsize=7, frameon=False, labelcolor=_TEXT)

@@ -253,19 +253,22 @@ def _league(results: Results) -> str:
     head = ["", "median ms", "p99 ms", "of the fastest"]
     for name in THROUGHPUTS:
         part = results.get(name) or {}
-        head += [f"actions/s, {_described(part)}", "a robot waits, p50 / p99 ms"] if part else ["", ""]
+        head += (
+            [f"actions/s of {part['clients']}, {policy_of(part)}", "a robot waits, p50 / p99 ms"] if part else ["", ""]
+        )
     text = "Round trips of one `act` on one machine, and the actions a second of many clients"
     return f"![{text}]({PICTURE})\n\n{text}; *other systems* run their own servers and clients:\n\n{_table(head, rows)}"
 
 
 def rows_of(part: Results) -> list[Results]:
     """Return the rows of a measurement of throughput, ours and the peers', each with the name of its way."""
-    return [*part.get("transports", {}).values(), *({"way": n, **row} for n, row in part.get("peers", {}).items())]
+    return [{"way": name, **row} for name, row in {**part.get("transports", {}), **part.get("peers", {})}.items()]
 
 
-def _described(part: Results) -> str:
-    config = part["config"]
-    return f"{part['clients']} clients, {config['base_ms']:g} ms + {config['per_item_ms']:g} ms a row"
+def policy_of(part: Results) -> str:
+    """Return the policy of a measurement of throughput, with its settings and the largest batch."""
+    settings = "".join(f", {key} {value}" for key, value in part["config"].items())
+    return f"{part['policy']}{settings}, batches of {part['batch']} at most"
 
 
 def _rate(point: Results) -> str:
@@ -304,11 +307,9 @@ def _throughput(part: Results) -> str:
         rates = {point["clients"]: _rate(point) for point in row["curve"]}
         name = f"*{row['way']}*" if row["way"] in part.get("peers", {}) else row["way"]
         rows.append((name, f"{row['of_ideal']:.3f}", *(rates.get(k, "") for k in counts), _waits(row)))
-    what = f"`{part['policy']}`" + "".join(f", {key} {value}" for key, value in part["config"].items())
     text = (
-        f"Actions a second of one replica by K clients ({what}, batches of {part['batch']} at most; ideal "
-        f"{part['ideal_actions_per_s']:.0f}, {part['ideal_is']}), and what a robot among {part['clients'] - 1} "
-        f"simulations waits:"
+        f"Actions a second of one replica by K clients ({policy_of(part)}; ideal {part['ideal_actions_per_s']:.0f}, "
+        f"{part['ideal_is']}), and how long a robot among {part['clients'] - 1} simulations waits:"
     )
     return f"{text}\n\n{_table(head, rows)}"
 

@@ -95,7 +95,7 @@ def measure_throughput(plan: ThroughputPlan, progress: Callable[[str], None] = l
         obs = Path(stack.enter_context(tempfile.TemporaryDirectory())) / "observation.npz"
         save_observation(observation(), obs)
         running: dict[str, others.PeerServer] = {}
-        peers = {one.name: stack.enter_context(_peer_fleet(one, plan, obs, running)) for one in theirs if one.several}
+        peers = {one.name: stack.enter_context(peer_fleet(one, plan, obs, running)) for one in theirs if one.several}
         fleets = ours | peers
         turns: dict[str, _Turns] = {name: _Turns({k: [] for k in plan.clients}, []) for name in fleets}
         bare_rates = []
@@ -144,7 +144,7 @@ class _Part:
 
 
 @dataclass(frozen=True, slots=True)
-class _Fleet:
+class Fleet:
     """All clients of one transport or peer: one robot in the first part, simulations in the others, if any."""
 
     parts: Sequence[_Part]
@@ -167,19 +167,20 @@ class _Fleet:
 
 
 @contextlib.contextmanager
-def _fleet(client: OwnClient, url: str, app: str, clients: int) -> Iterator[_Fleet]:
+def _fleet(client: OwnClient, url: str, app: str, clients: int) -> Iterator[Fleet]:
     make = _actor if client.actor else _process
     address = f"serve://{app}" if client.actor else url
     with contextlib.ExitStack() as stack:
-        yield _Fleet([stack.enter_context(make(client, address, *part)) for part in _parts(clients)])
+        yield Fleet([stack.enter_context(make(client, address, *part)) for part in _parts(clients)])
 
 
 @contextlib.contextmanager
-def _peer_fleet(
+def peer_fleet(
     client: others.PeerClient, plan: ThroughputPlan, obs: Path, running: dict[str, others.PeerServer]
-) -> Iterator[_Fleet]:
+) -> Iterator[Fleet]:
+    """Start a peer's server, unless `running` has one that it shares, and its clients, within a context."""
     most = max(plan.clients)
-    policy = {**plan.config, "batch": plan.batch}
+    policy = {name: float(plan.config.get(name, 0.0)) for name in ("base_ms", "per_item_ms")} | {"batch": plan.batch}
     with contextlib.ExitStack() as stack:
         server = stack.enter_context(others.serving(client, plan.peers_python, running, policy))
         words = [*client.command(plan.peers_python), "load", *server.address, str(obs), client.mode, json.dumps(policy)]
@@ -190,7 +191,7 @@ def _peer_fleet(
         for child in children:
             child.read(START_S)
         server.signal(signal.SIGSTOP)
-        yield _Fleet([_part(child) for child in children], server.turn)
+        yield Fleet([_part(child) for child in children], server.turn)
 
 
 def _parts(clients: int) -> list[tuple[int, int]]:
@@ -325,7 +326,7 @@ def main(
         )  # fmt: skip
         found = measure_throughput(plan, progress)
     show_throughput(found)
-    save({**origin, **found}, json_file)
+    save({**origin, **found, "versions": origin["versions"] | found["versions"]}, json_file)
 
 
 def show_throughput(found: Mapping[str, Any]) -> None:

@@ -66,6 +66,7 @@ class PeerClient:
     server: bool = True  # whether its server is a process of its own
     one_process: bool = False  # whether all its clients must be in one process
     polls: bool = False  # whether its idle server takes whole cores, so that it is stopped between turns
+    shares: bool = False  # whether the clients of its script share a server
 
     def python(self, python: Path) -> Path:
         """Return the Python of its environment, where `python` is that of the first."""
@@ -91,8 +92,8 @@ PEER_CLIENTS = (
         "TorchRL", "torchrl", "torchrl_peer.py", "slots", ("torchrl", "tensordict", "torch"), TORCH,
         server=False, one_process=True,
     ),
-    PeerClient("Ray Serve HTTP", "ray-serve", "ray_serve_peer.py", "http", _RAY_SERVE, TORCH),
-    PeerClient("Ray Serve handle", "ray-serve", "ray_serve_peer.py", "handle", _RAY_SERVE, TORCH),
+    PeerClient("Ray Serve HTTP", "ray-serve", "ray_serve_peer.py", "http", _RAY_SERVE, TORCH, shares=True),
+    PeerClient("Ray Serve handle", "ray-serve", "ray_serve_peer.py", "handle", _RAY_SERVE, TORCH, shares=True),
     PeerClient("LeRobot", "lerobot", "lerobot_peer.py", "pickle", ("lerobot", "grpcio", "torch"), TORCH, several=False),
 )  # fmt: skip
 PEERS = tuple(dict.fromkeys(one.peer for one in PEER_CLIENTS))
@@ -179,7 +180,7 @@ class _PeerDriver(ClientProcess):
 def serving(
     client: PeerClient, python: Path, running: dict[str, PeerServer], policy: Policy, *, host: str = LOOPBACK
 ) -> Iterator[PeerServer]:
-    """Run a peer's server within a context, unless `running` has one of its script: then yield that."""
+    """Run a peer's server within a context, unless `running` has one that it shares: then yield that."""
     if client.script in running:
         yield running[client.script]
         return
@@ -190,7 +191,7 @@ def serving(
             command = [*client.command(python), "serve", *address, json.dumps(dict(policy))]
             process = stack.enter_context(LineProcess(f"{client.name}, server", command, ALONE))
         server = PeerServer(address, process, client.polls)
-        if client.server:
+        if client.shares:
             running[client.script] = server
         try:
             yield server

@@ -35,6 +35,7 @@ from benchmarks.checkpoints import __main__ as checkpoints
         (success, ["--only", "again;faster"], "faster"),
         (throughput, ["--clients", "few"], "few"),
         (throughput, ["--set", "base_ms=1"], "--policy"),
+        (throughput, ["--peers", "openpi", "--policy", "scripted"], "noop"),
     ],
 )
 def test_mistakes_are_reported_in_a_line(module: ModuleType, words: list[str], text: str) -> None:

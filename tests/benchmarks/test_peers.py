@@ -5,16 +5,28 @@ from __future__ import annotations
 import signal
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 import typescript_client
 from client_servers import client_servers
 from eval_fakes import wait_for
+from peer_environment import peers_python
 
 from benchmarks import clients
 from benchmarks.own_clients import observation, save_observation
-from benchmarks.peers import SCRIPTS, PeerClient, installed, peer_clients, peer_connected
+from benchmarks.peers import (
+    PEER_CLIENTS,
+    SCRIPTS,
+    PeerClient,
+    PeerServer,
+    installed,
+    peer_clients,
+    peer_connected,
+    serving,
+)
+from benchmarks.throughput import ThroughputPlan, peer_fleet
 from vlagents_ray.bench.line_process import ProcessFailed
 from vlagents_ray.errors import ConfigError
 from vlagents_ray.serve.launch.server import free_port
@@ -41,6 +53,7 @@ def connect(target):
 peer.run(serve, connect)
 """
 PYTHON = Path(sys.executable)
+FEW = ThroughputPlan(config={"base_ms": 2.0, "per_item_ms": 1.0}, batch=2, clients=(2,), peers_python=PYTHON)
 
 
 @pytest.fixture(name="fake")
@@ -107,6 +120,63 @@ def test_a_killed_bench_takes_its_processes_along(fake: PeerClient, obs: Path, c
         wait_for(lambda: b"fake_peer" in Path(f"/proc/{pid}/cmdline").read_bytes())
         bench.send_signal(signal.SIGKILL)
     wait_for(lambda: gone(pid))
+
+
+def state(pid: int) -> str:
+    return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0]
+
+
+def test_a_server_that_polls_is_stopped_between_the_turns_of_its_clients(fake: PeerClient, obs: Path) -> None:
+    polling = replace(fake, polls=True, shares=True)
+    running: dict[str, PeerServer] = {}
+    with peer_connected(polling, PYTHON, obs, running) as driver:
+        server = running[fake.script]
+        assert server.process is not None
+        driver.ready()
+        assert state(server.process.pid) != "T"
+        driver.measure(1)
+        wait_for(lambda: state(server.process.pid) == "T")
+        with server.turn():
+            wait_for(lambda: state(server.process.pid) != "T")
+    assert gone(server.process.pid)
+    assert running == {}
+
+
+def test_clients_of_one_script_share_a_server_if_it_says_so(fake: PeerClient, obs: Path) -> None:
+    for shares in (True, False):
+        one, running = replace(fake, shares=shares), {}
+        with serving(one, PYTHON, running, {}) as first, serving(one, PYTHON, running, {}) as second:
+            assert (first.address == second.address) is shares
+
+
+def test_a_fleet_makes_load_with_the_policy_of_the_plan(fake: PeerClient, obs: Path) -> None:
+    for one in (fake, replace(fake, one_process=True)):
+        with peer_fleet(one, FEW, obs, {}) as fleet:
+            assert len(fleet.parts) == (1 if one.one_process else 3)
+            both = fleet.run(0, 2, 0.1)
+            robot, simulation = fleet.run(1, 1, 0.3)
+        assert len(both) == 2
+        for calls in (*both, simulation, robot):
+            assert all(rest == [5.0, 3] for _, _, *rest in calls)  # 2 ms and 1 ms a row, of which the fake says three
+        assert 0 < len(robot) < len(simulation)
+
+
+@pytest.mark.slow
+@pytest.mark.integration
+@pytest.mark.server
+@pytest.mark.parametrize("client", PEER_CLIENTS, ids=lambda client: client.name)
+def test_a_peer_answers_its_own_clients(client: PeerClient, obs: Path) -> None:
+    python = peers_python()
+    peers_python(client.environment)
+    with peer_connected(client, python, obs, {}) as driver:
+        driver.ready()
+        assert len(driver.measure(5)) == 5
+    if client.several:
+        with peer_fleet(client, replace(FEW, peers_python=python), obs, {}) as fleet:
+            robot, simulation = fleet.run(1, 1, 2.0)
+        assert robot
+        assert simulation
+        assert {(inference, rows) for _, _, inference, rows in (*robot, *simulation)} <= {(3.0, 1), (4.0, 2)}
 
 
 def test_peers_are_named(tmp_path: Path) -> None:

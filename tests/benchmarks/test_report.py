@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import copy
+from pathlib import Path
 from typing import Any
 
 import pytest
 
+from benchmarks.picture import plot_league
 from benchmarks.report import BEGIN, DEFAULT, END, JPEG, outcomes, replaced, section
 from vlagents_ray.errors import ConfigError
 
@@ -52,6 +54,12 @@ RESULTS: dict[str, Any] = {
                 "robot": {"wait_p50_ms": 20.0, "wait_p99_ms": 40.0},
             },
         },
+        "peers": {
+            "openpi": {
+                "of_ideal": 0.1, "robot": None,
+                "curve": [{"clients": k, "actions_per_s": 47.1, "ci95": [46.0, 48.2]} for k in (8, 32)],
+            },
+        },
     },
 }  # fmt: skip
 
@@ -88,8 +96,9 @@ def test_the_section_names_machine_date_versions_and_command() -> None:
         "vla-eval (not installed)",
     ):
         assert part in text
-    assert "| shm | 0.110 (0.110 to 0.120) | 0.22 | 0.22 | 0.06 | 0.18 | 0.04 |" in text
-    assert "| *openpi* | 0.600 (0.600 to 0.610) | 1.20 |  |  |  |  |" in text
+    assert "| shm | 0.110 (0.110 to 0.120) | 0.22 | 1 | 400 | 20.0 / 40.0 |  |  |" in text
+    assert "| *openpi* | 0.600 (0.600 to 0.610) | 1.20 | 5.45 | 47 (46 to 48) |  |  |  |" in text
+    assert "| *openpi* | 0.100 | 47 (46 to 48) | 47 (46 to 48) |  |" in text
     assert "a link of 953 Mbit/s" in text
 
 
@@ -107,6 +116,16 @@ def test_every_row_of_a_table_has_as_many_cells_as_its_head() -> None:
             continue
         cells = cells or line.count("|")
         assert line.count("|") == cells
+
+
+def test_the_picture_has_all_systems(tmp_path: Path) -> None:
+    results = {**RESULTS, "without_gain": None}
+    for file in (tmp_path / "one.svg", tmp_path / "two.svg"):
+        plot_league(results, file)
+    text = (tmp_path / "one.svg").read_text()
+    assert text == (tmp_path / "two.svg").read_text()
+    for name in ("openpi", "vlagents JPEG", "plasma, Ray actor", "actions/s", "batches of 16"):
+        assert name in text
 
 
 def test_only_what_is_between_the_markers_is_replaced() -> None:
