@@ -23,6 +23,7 @@ from benchmarks.rtt import measure_with_peers
 from benchmarks.throughput import WITHOUT_GAIN, ThroughputPlan, measure_throughput
 from vlagents_ray.cli.console import errors, out, progress, table
 from vlagents_ray.errors import ConfigError
+from vlagents_ray.registry import require
 
 COMMAND = "python -m benchmarks.report"
 BEGIN, END = "<!-- bench -->", "<!-- /bench -->"
@@ -67,12 +68,14 @@ def collect(
 
 def write(results: Mapping[str, Any], page: Path, json_file: Path | None) -> None:
     """Write the section into the page, its picture beside it, and the figures into `json_file` for the next time."""
-    text = replaced(page.read_text(), section(results))
-    if results.get("rtt"):
-        plot_league(results, page.parent / PICTURE)
     if json_file is not None:
         json_file.parent.mkdir(parents=True, exist_ok=True)
         json_file.write_text(json.dumps(results, indent=1) + "\n")
+    text = replaced(page.read_text(), section(results))
+    if results.get("rtt"):
+        picture = page.parent / PICTURE
+        picture.parent.mkdir(exist_ok=True)
+        plot_league(results, picture)
     page.write_text(text)
 
 
@@ -355,6 +358,7 @@ def main(
         if not page.is_file():
             raise ConfigError(f"--page {page}: does not exist")
         replaced(page.read_text(), "")  # raises without markers, before anything is measured
+        require("matplotlib")
         if from_json:
             try:
                 results = json.loads(json_file.read_text())

@@ -18,7 +18,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
@@ -106,7 +106,9 @@ def peer_clients(names: Sequence[str], python: Path) -> tuple[list[PeerClient], 
     wanted = PEERS if "all" in names else tuple(names)
     if unknown := set(wanted) - set(PEERS):
         raise ConfigError(f"peers: got {sorted(unknown)}, want some of {list(PEERS)}, or 'all'")
-    found, skipped, versions = [], {}, {}
+    found: list[PeerClient] = []
+    skipped: dict[str, str] = {}
+    versions: dict[str, str] = {}
     cure = "`python -m benchmarks.peers` makes an environment for them"
     there: dict[Path, dict[str, str]] = {}
     for one in PEER_CLIENTS:
@@ -171,6 +173,10 @@ class _PeerDriver(ClientProcess):
         super().__init__(name, command, ALONE)
         self._server = server
 
+    def ready(self) -> dict[str, Any]:
+        with self._server.turn():
+            return super().ready()
+
     def measure(self, calls: int) -> list[float]:
         with self._server.turn():
             return super().measure(calls)
@@ -230,8 +236,8 @@ def starters(
 def set_up(folder: Path, requirements: Path = REQUIREMENTS, progress: Callable[[str], None] = lambda _: None) -> Path:
     """Make an environment, or update it to the pinned versions; returns its Python.
 
-    It has no package of ours, since the peers' packages conflict with them. torch is a build for
-    CPUs. Raises `ConfigError` with the end of uv's output if that fails.
+    It has no package of ours, since the peers' packages conflict with them, and a torch for CPUs. Raises `ConfigError`
+    with the end of uv's output if that fails.
     """
     from vlagents_ray.serve.python_env.create import create, install, require_no_cuda
 

@@ -5,6 +5,7 @@ It imports only the standard library and numpy, as it runs in other environments
 
 from __future__ import annotations
 
+import functools
 import importlib.util
 import json
 import os
@@ -174,13 +175,13 @@ def run(
                 (client,) = clients
                 obey(sys.stdin, out, lambda calls: timed(client.observe, client.act, calls), {})
             else:
-                _load_server(clients, robots, policy, out)
+                _make_load(clients, robots, policy, out)
         finally:
             for client in clients:
                 client.close()
 
 
-def _load_server(clients: list[Client], robots: int, policy: Policy, out: TextIO) -> None:
+def _make_load(clients: list[Client], robots: int, policy: Policy, out: TextIO) -> None:
     """Answer each line, the arguments of `ClosedLoop.run`, with its calls."""
 
     def act(client: Client) -> tuple[float, float, int]:
@@ -189,7 +190,7 @@ def _load_server(clients: list[Client], robots: int, policy: Policy, out: TextIO
         rows = int(np.ravel(client.act(obs))[0])
         return (time.perf_counter() - begun) * 1e3, policy.ms(rows), rows
 
-    loop = ClosedLoop([lambda client=client: act(client) for client in clients], robots)
+    loop = ClosedLoop([functools.partial(act, client) for client in clients], robots)
     print(json.dumps(True), file=out, flush=True)
     for line in sys.stdin:
         wanted = json.loads(line)

@@ -48,7 +48,7 @@ def _server(target: peer.Target) -> InferenceServer:
 def connect(target: peer.Target) -> peer.Client:
     """Make a client of TorchRL."""
     client, obs = _server(target).client(), _observation(target)
-    return peer.Client(lambda: obs, lambda obs: client(obs)["action"].numpy(), _server(target).shutdown)
+    return peer.Client(lambda: obs, lambda obs: client(obs)["action"].numpy())
 
 
 if __name__ == "__main__":

@@ -133,8 +133,8 @@ def test_a_server_that_polls_is_stopped_between_the_turns_of_its_clients(fake: P
         server = running[fake.script]
         assert server.process is not None
         driver.ready()
-        assert state(server.process.pid) != "T"
-        driver.measure(1)
+        wait_for(lambda: state(server.process.pid) == "T")
+        assert len(driver.measure(2)) == 2
         wait_for(lambda: state(server.process.pid) == "T")
         with server.turn():
             wait_for(lambda: state(server.process.pid) != "T")
