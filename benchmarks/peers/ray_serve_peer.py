@@ -50,7 +50,7 @@ class Model:
 
 def serve(host: str, port: int, policy: peer.Policy) -> None:
     """Run the server until the process ends."""
-    ray.init(address="local", num_cpus=4, include_dashboard=False)
+    ray.init(address="local", num_cpus=4, include_dashboard=False, object_store_memory=2**28)
     ray_serve.start(http_options={"host": host, "port": port})
     ray_serve.run(Model.bind(policy))
     threading.Event().wait()
