@@ -9,6 +9,8 @@ import contextlib
 import functools
 import inspect
 import json
+import math
+import os
 import random
 import sys
 import time
@@ -20,7 +22,7 @@ from typing import Any, get_args
 
 import numpy as np
 
-from benchmarks.drivers import CALL_S, START_S, ClientProcess, Driver
+from benchmarks.drivers import CALL_S, START_S, ClientProcess, ProcessDriver
 from vlagents_ray.bench.line_client import WARM_UP, die_with_parent, obey, own_stdout, timed
 from vlagents_ray.bench.line_process import our_environment
 from vlagents_ray.client.agent import RemoteAgent
@@ -29,7 +31,8 @@ from vlagents_ray.errors import ConfigError
 from vlagents_ray.images.codecs import ImageCodec
 from vlagents_ray.interface import Obs
 
-Call = tuple[float, float, float, int]  # ended, s of time.monotonic; round trip, ms; inference, ms; size of its batch
+# Ended, s of time.monotonic; round trip, ms, or with a rate the time since its tick; inference, ms; size of its batch.
+Call = tuple[float, float, float, int]
 ROBOT, SIMULATION = "robot", "simulation"
 _THINK_S = 0.05  # longest pause of a robot after an answer, so that it meets batches at any stage
 
@@ -116,7 +119,11 @@ class BenchCaller:
         self._agent = connect(url, transport, codec)
         self._obs = observation()
         info = self._agent.reset(self._obs, "measure")
-        self.description: dict[str, Any] = {"transport": self._agent.transport, "psnr_db": info.get("psnr_db")}
+        self.description: dict[str, Any] = {
+            "transport": self._agent.transport,
+            "psnr_db": info.get("psnr_db"),
+            "pid": os.getpid(),
+        }
 
     def measure(self, calls: int) -> list[float]:
         return timed(lambda: self._obs, self._agent.act, calls)
@@ -138,23 +145,31 @@ class LoadGenerator:
         self._ranks = list(ranks)
         self._agents = [connect(url, transport, codec, rank) for rank in ranks]
         self._pool = ThreadPoolExecutor(max(1, len(ranks)))
-        for ready in [self._pool.submit(agent.reset, self._obs, "measure") for agent in self._agents]:
-            ready.result()
+        # One after another, since a server accepts only so many handshakes at once.
+        self._replicas = [agent.reset(self._obs, "measure").get("pid") for agent in self._agents]
 
-    def ready(self) -> bool:
-        """Answer an actor's caller once `__init__` is done."""
-        return True
+    def ready(self) -> list[int | None]:
+        """Return the process of each client's replica, if the policy states it."""
+        return self._replicas
 
-    def run(self, active: int, begin: float, end: float) -> list[list[Call]]:
+    def run(self, active: int, begin: float, end: float, hz: float | None = None) -> list[list[Call]]:
         """Run the first `active` clients until `end`, s of `time.monotonic`.
 
-        All clients begin at the same moment of the machine's monotonic clock, in every process and actor.
+        All clients begin at the same moment of the machine's monotonic clock, in every process and actor. With `hz`,
+        each acts at its own ticks of that rate, the first at a random moment of the first period.
 
         Returns:
             For each client its calls that ended after `begin`.
         """
         acting = list(zip(self._agents, self._ranks, strict=True))[:active]
-        return [one.result() for one in [self._pool.submit(self._act, *each, begin, end) for each in acting]]
+        if hz is None:
+            made = [self._pool.submit(self._act, *each, begin, end) for each in acting]
+        else:
+            phase = random.Random(os.getpid())  # other phases in each process
+            made = [
+                self._pool.submit(self._pace, agent, begin + phase.uniform(0, 1 / hz), end, hz) for agent, _ in acting
+            ]
+        return [one.result() for one in made]
 
     def close(self) -> None:
         for agent in self._agents:
@@ -173,17 +188,31 @@ class LoadGenerator:
                 calls.append((ended, timing["round_trip_ms"], timing["inference_ms"], int(timing["batch_size"])))
         return calls
 
+    def _pace(self, agent: RemoteAgent, tick: float, end: float, hz: float) -> list[Call]:
+        """Act at `tick`, s, and at each further one that does not pass during an act."""
+        calls = []
+        while tick < end:
+            time.sleep(max(0.0, tick - time.monotonic()))
+            timing = agent.act(self._obs).info["timing"]
+            ended = time.monotonic()
+            calls.append((ended, 1e3 * (ended - tick), timing["inference_ms"], int(timing["batch_size"])))
+            tick += max(1, math.ceil((ended - tick) * hz)) / hz
+        return calls
 
-@dataclass(frozen=True, slots=True)
+
+@dataclass(slots=True)
 class ActorDriver:
     """A client in a Ray actor, as rollouts are."""
 
     actor: Any
+    pid: int = 0  # of the actor's process, once it is ready
+    server_pid: int | None = None
 
     def ready(self) -> dict[str, Any]:
         import ray
 
         said: dict[str, Any] = ray.get(self.actor.ready.remote(), timeout=START_S)
+        self.pid = said["pid"]
         return said
 
     def measure(self, calls: int) -> list[float]:
@@ -194,7 +223,7 @@ class ActorDriver:
 
 
 @contextlib.contextmanager
-def connected(client: OwnClient, url: str, app: str, prefix: Sequence[str] = ()) -> Iterator[Driver]:
+def connected(client: OwnClient, url: str, app: str, prefix: Sequence[str] = ()) -> Iterator[ProcessDriver]:
     """Start a client of ours to the server at `url`; its command begins with `prefix`."""
     if client.actor:
         import ray

@@ -20,7 +20,7 @@ from typing import Annotated
 
 import typer
 
-from benchmarks.drivers import START_S, ClientProcess, Driver
+from benchmarks.drivers import START_S, ClientProcess, ProcessDriver
 from benchmarks.round_trips import LOOPBACK, StartClient
 from vlagents_ray.bench.line_process import LineProcess
 from vlagents_ray.errors import ConfigError
@@ -98,14 +98,15 @@ def installed(python: Path, distributions: Sequence[str]) -> dict[str, str]:
 @contextlib.contextmanager
 def peer_connected(
     client: PeerClient, python: Path, obs: Path, *, host: str = LOOPBACK, prefix: Sequence[str] = ()
-) -> Iterator[Driver]:
+) -> Iterator[ProcessDriver]:
     """Run a peer's server on `host`, and its client, whose command begins with `prefix`, within a context."""
     command, address = [str(python), str(SCRIPTS / client.script)], (host, str(free_port(host)))
     alone = {"PYTHONPATH": ""}  # nothing of ours in the peer's environment
     with (
-        LineProcess(f"{client.name}, server", [*command, "serve", *address], alone),
+        LineProcess(f"{client.name}, server", [*command, "serve", *address], alone) as server,
         ClientProcess(client.name, [*prefix, *command, "drive", *address, str(obs), client.mode], alone) as process,
     ):
+        process.server_pid = server.pid
         yield process
 
 
