@@ -25,6 +25,7 @@ from benchmarks.autoscaling import check_plot_file
 from benchmarks.console import Json, Seconds, parse_counts, save
 from benchmarks.drivers import START_S
 from benchmarks.figures import measured_on
+from benchmarks.own_clients import Call
 from benchmarks.processes import UsageMeter, server_processes
 from benchmarks.round_trips import IDLE_S
 from vlagents_ray.bench.line_process import LineProcess, our_environment
@@ -92,7 +93,7 @@ def _point(plan: GrowthPlan, server: Server, sessions: int, hz: float) -> dict[s
             clients.append(stack.enter_context(LineProcess("clients", command, our_environment())))
         replicas = Counter(pid for one in clients for pid in one.read(START_S + _CONNECT_S * sessions))
 
-        def run(seconds: float) -> list[list[Any]]:
+        def run(seconds: float) -> list[Call]:
             begin = time.monotonic() + _AHEAD_S
             spec = {"active": sessions, "begin": begin, "end": begin + seconds, "hz": hz}
             for one in clients:
@@ -108,20 +109,27 @@ def _point(plan: GrowthPlan, server: Server, sessions: int, hz: float) -> dict[s
         idle_server_cores = server.mark_idle()
         with client.counting(), server.counting():
             calls = run(plan.seconds)
-    ms = np.array([call[1] for call in calls])
-    ticks = np.maximum(1, np.ceil(ms * hz / 1e3))  # each act's own, and those that passed during it
     return {
         "sessions": sessions,
         "hz": hz,
+        "acts_per_s": len(calls) / plan.seconds,
+        **figures(calls, hz),
+        "idle_server_cores": idle_server_cores,
+        "sessions_by_replica": sorted(replicas.values()),
+        "client": client.per_act(len(calls)),
+        "server": server.per_act(len(calls)),
+    }
+
+
+def figures(calls: Sequence[Call], hz: float) -> dict[str, Any]:
+    """Return the number of acts of clients with the rate `hz`, the share on time of all ticks, and quantiles, ms."""
+    ms = np.array([since_tick for _, since_tick, _, _ in calls])
+    ticks = np.maximum(1, np.ceil(ms * hz / 1e3))  # each act's own, and those that passed during it
+    return {
         "acts": len(ms),
-        "acts_per_s": len(ms) / plan.seconds,
         "on_time": float(np.sum(ms * hz <= 1e3) / np.sum(ticks)),
         "p50_ms": float(np.median(ms)),
         "p99_ms": float(np.quantile(ms, 0.99)),
-        "idle_server_cores": idle_server_cores,
-        "sessions_by_replica": sorted(replicas.values()),
-        "client": client.per_act(len(ms)),
-        "server": server.per_act(len(ms)),
     }
 
 
