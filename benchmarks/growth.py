@@ -63,12 +63,10 @@ def measure_growth(plan: GrowthPlan, progress: Callable[[str], None] = lambda _:
 
     The curve of replicas has as many sessions as there are robots.
     """
-    rate = plan.acts_per_s
+    limit, rate = max(plan.robots, *plan.sessions), plan.acts_per_s
     found: dict[str, Any] = {"plan": asdict(plan), "sessions": [], "replicas": []}
     for replicas in sorted({1, *plan.replicas}):
-        limit = max(plan.robots, *plan.sessions)
-        served = deployment(POLICY, replicas=replicas, sessions={"limit": limit})
-        with running_server(served) as server:
+        with running_server(deployment(POLICY, replicas=replicas, sessions={"limit": limit})) as server:
             if replicas == 1:
                 found["fleet"] = _point(plan, server, plan.robots, plan.hz)
                 progress(f"{plan.robots} robots: {found['fleet']['on_time']:.1%} of the acts on time")
@@ -76,7 +74,9 @@ def measure_growth(plan: GrowthPlan, progress: Callable[[str], None] = lambda _:
                     found["sessions"].append(_point(plan, server, n, rate / n))
                     progress(f"{n} sessions: {found['sessions'][-1]['p50_ms']:.2f} ms")
             if replicas in plan.replicas:
-                found["replicas"].append(_point(plan, server, plan.robots, rate / plan.robots) | {"replicas": replicas})
+                found["replicas"].append(
+                    {"replicas": replicas, **_point(plan, server, plan.robots, rate / plan.robots)}
+                )
                 progress(f"{replicas} replicas: {found['replicas'][-1]['p50_ms']:.2f} ms")
     return found
 
@@ -102,12 +102,12 @@ def _point(plan: GrowthPlan, server: Server, sessions: int, hz: float) -> dict[s
 
         run(_WARM_S)
         pids = [one.pid for one in clients]
-        client, server = UsageMeter(pids), UsageMeter(server_processes(os.getpid(), pids))
-        with client.counting(), server.counting():
+        used, served = UsageMeter(pids), UsageMeter(server_processes(os.getpid(), pids))
+        with used.counting(), served.counting():
             time.sleep(IDLE_S)
-        client.mark_idle()
-        idle_server_cores = server.mark_idle()
-        with client.counting(), server.counting():
+        used.mark_idle()
+        idle_server_cores = served.mark_idle()
+        with used.counting(), served.counting():
             calls = run(plan.seconds)
     return {
         "sessions": sessions,
@@ -116,8 +116,8 @@ def _point(plan: GrowthPlan, server: Server, sessions: int, hz: float) -> dict[s
         **figures(calls, hz),
         "idle_server_cores": idle_server_cores,
         "sessions_by_replica": sorted(replicas.values()),
-        "client": client.per_act(len(calls)),
-        "server": server.per_act(len(calls)),
+        "client": used.per_act(len(calls)),
+        "server": served.per_act(len(calls)),
     }
 
 
@@ -137,15 +137,16 @@ def show_growth(found: Mapping[str, Any]) -> None:
     """Print a row for the fleet, and for each point of the curves."""
     rows = table(
         "", "sessions", "replicas", "acts/s", "on time", "p50 ms", "p99 ms", "client CPU ms", "server CPU ms",
-        "server waits", "idle server, cores", "sessions by replica",
+        "server waits", "server, cores", "idle", "sessions by replica",
     )  # fmt: skip
     for name, points in (("robots", [found["fleet"]]), *((name, found[name]) for name in CURVES)):
         for one in points:
             rows.add_row(
-                name, str(one["sessions"]), str(len(one["sessions_by_replica"])), f"{one['acts_per_s']:.1f}",
+                name, str(one["sessions"]), str(one.get("replicas", 1)), f"{one['acts_per_s']:.1f}",
                 f"{one['on_time']:.1%}", f"{one['p50_ms']:.2f}", f"{one['p99_ms']:.2f}",
                 f"{one['client']['cpu_ms']:.3f}", f"{one['server']['cpu_ms']:.3f}",
-                f"{one['server']['voluntary_switches']:.1f}", f"{one['idle_server_cores']:.3f}",
+                f"{one['server']['voluntary_switches']:.1f}",
+                f"{1e-3 * one['server']['cpu_ms'] * one['acts_per_s']:.3f}", f"{one['idle_server_cores']:.3f}",
                 ", ".join(map(str, one["sessions_by_replica"])),
             )  # fmt: skip
         rows.add_section()
