@@ -22,10 +22,9 @@ import numpy as np
 import typer
 
 from benchmarks.autoscaling import check_plot_file
-from benchmarks.console import Json, Seconds, parse_counts, save
+from benchmarks.console import Json, parse_counts, save
 from benchmarks.drivers import START_S
 from benchmarks.figures import measured_on
-from benchmarks.own_clients import Call
 from benchmarks.processes import UsageMeter, server_processes
 from benchmarks.round_trips import IDLE_S
 from vlagents_ray.bench.line_process import LineProcess, our_environment
@@ -38,11 +37,11 @@ from vlagents_ray.serve.launch.server import Server, running_server
 POLICY = "benchmarks.live:Measured"  # its `reset` returns the id of the replica's process
 TRANSPORTS = ("websocket", "http", "shm")  # of clients outside of Ray
 CURVES = ("sessions", "replicas")
-_PROCESSES = 4  # shared by the clients
+_PROCESSES = 4  # shared by the robots
 _AHEAD_S = 0.5  # by which the clients' processes know when to begin
 _WARM_S = 1.0
 _LATE_S = 60.0
-_CONNECT_S = 0.1  # for each client
+_CONNECT_S = 0.1  # for each robot
 
 
 @dataclass(frozen=True, slots=True)
@@ -82,23 +81,21 @@ def measure_growth(plan: GrowthPlan, progress: Callable[[str], None] = lambda _:
 
 
 def _point(plan: GrowthPlan, server: Server, sessions: int, hz: float) -> dict[str, Any]:
-    """Measure `sessions` clients that act at `hz` each."""
+    """Measure `sessions` robots that act at `hz` each."""
     parts = min(_PROCESSES, sessions)
     shares = [sessions // parts + (part < sessions % parts) for part in range(parts)]
     with contextlib.ExitStack() as stack:
         clients = []
         for share in shares:
-            settings = {"url": server.url, "transport": plan.transport, "codec": "jpeg", "ranks": ["robot"] * share}
-            command = [sys.executable, "-m", "benchmarks.own_clients", json.dumps(settings)]
-            clients.append(stack.enter_context(LineProcess("clients", command, our_environment())))
+            command = [sys.executable, "-m", "benchmarks.robots", server.url, plan.transport, str(share)]
+            clients.append(stack.enter_context(LineProcess("robots", command, our_environment())))
         replicas = Counter(pid for one in clients for pid in one.read(START_S + _CONNECT_S * sessions))
 
-        def run(seconds: float) -> list[Call]:
+        def run(seconds: float) -> np.ndarray:
             begin = time.monotonic() + _AHEAD_S
-            spec = {"active": sessions, "begin": begin, "end": begin + seconds, "hz": hz}
             for one in clients:
-                one.send(json.dumps(spec))
-            return [call for one in clients for calls in one.read(seconds + _LATE_S) for call in calls]
+                one.send(json.dumps({"begin": begin, "end": begin + seconds, "hz": hz}))
+            return np.array([ms for one in clients for ms in one.read(seconds + _LATE_S)])
 
         run(_WARM_S)
         pids = [one.pid for one in clients]
@@ -108,25 +105,24 @@ def _point(plan: GrowthPlan, server: Server, sessions: int, hz: float) -> dict[s
         used.mark_idle()
         idle_server_cores = served.mark_idle()
         with used.counting(), served.counting():
-            calls = run(plan.seconds)
+            ms = run(plan.seconds)
     return {
         "sessions": sessions,
         "hz": hz,
-        "acts_per_s": len(calls) / plan.seconds,
-        **figures(calls, hz),
+        "acts": len(ms),
+        "acts_per_s": len(ms) / plan.seconds,
+        **figures(ms, hz),
         "idle_server_cores": idle_server_cores,
         "sessions_by_replica": sorted(replicas.values()),
-        "client": used.per_act(len(calls)),
-        "server": served.per_act(len(calls)),
+        "client": used.per_act(len(ms)),
+        "server": served.per_act(len(ms)),
     }
 
 
-def figures(calls: Sequence[Call], hz: float) -> dict[str, Any]:
-    """Return the number of acts of clients with the rate `hz`, the share on time of all ticks, and quantiles, ms."""
-    ms = np.array([since_tick for _, since_tick, _, _ in calls])
+def figures(ms: np.ndarray, hz: float) -> dict[str, Any]:
+    """Return the share on time of all ticks, and quantiles of acts at the rate `hz` that end `ms` after their ticks."""
     ticks = np.maximum(1, np.ceil(ms * hz / 1e3))  # each act's own, and those that passed during it
     return {
-        "acts": len(ms),
         "on_time": float(np.sum(ms * hz <= 1e3) / np.sum(ticks)),
         "p50_ms": float(np.median(ms)),
         "p99_ms": float(np.quantile(ms, 0.99)),
@@ -179,8 +175,8 @@ def main(
     hz: Annotated[float, typer.Option(min=0.1, help="Of each robot of the fleet.")] = 10.0,
     sessions: Annotated[str, typer.Option(help="Numbers of sessions with one replica.")] = "1,4,16,64,256,1000",
     replicas: Annotated[str, typer.Option(help="Numbers of replicas.")] = "1,2,4,8",
-    rate: Annotated[float, typer.Option(min=1, help="Acts a second of all sessions of a curve together.")] = 50.0,
-    seconds: Seconds = 20.0,
+    rate: Annotated[float, typer.Option(min=10, help="Acts a second of all sessions of a curve together.")] = 50.0,
+    seconds: Annotated[float, typer.Option(min=1, help="Of each measurement.")] = 20.0,
     transport: Annotated[str, typer.Option(help="websocket, http or shm.")] = "websocket",
     json_file: Json = None,
     plot: Annotated[Path | None, typer.Option("--plot", help="Draw the curves here: .png, .svg or .pdf.")] = None,

@@ -9,7 +9,6 @@ import contextlib
 import functools
 import inspect
 import json
-import math
 import os
 import random
 import sys
@@ -31,8 +30,7 @@ from vlagents_ray.errors import ConfigError
 from vlagents_ray.images.codecs import ImageCodec
 from vlagents_ray.interface import Obs
 
-# Ended, s of time.monotonic; round trip, ms, or with a rate the time since its tick; inference, ms; size of its batch.
-Call = tuple[float, float, float, int]
+Call = tuple[float, float, float, int]  # ended, s of time.monotonic; round trip, ms; inference, ms; size of its batch
 ROBOT, SIMULATION = "robot", "simulation"
 _THINK_S = 0.05  # longest pause of a robot after an answer, so that it meets batches at any stage
 
@@ -145,31 +143,23 @@ class LoadGenerator:
         self._ranks = list(ranks)
         self._agents = [connect(url, transport, codec, rank) for rank in ranks]
         self._pool = ThreadPoolExecutor(max(1, len(ranks)))
-        # One after another, since a server accepts only so many handshakes at once.
-        self._replicas = [agent.reset(self._obs, "measure").get("pid") for agent in self._agents]
+        for ready in [self._pool.submit(agent.reset, self._obs, "measure") for agent in self._agents]:
+            ready.result()
 
-    def ready(self) -> list[int | None]:
-        """Return the process of each client's replica, if the policy states it."""
-        return self._replicas
+    def ready(self) -> bool:
+        """Answer an actor's caller once `__init__` is done."""
+        return True
 
-    def run(self, active: int, begin: float, end: float, hz: float | None = None) -> list[list[Call]]:
+    def run(self, active: int, begin: float, end: float) -> list[list[Call]]:
         """Run the first `active` clients until `end`, s of `time.monotonic`.
 
-        All clients begin at the same moment of the machine's monotonic clock, in every process and actor. With `hz`,
-        each acts at its own ticks of that rate, the first at a random moment of the first period.
+        All clients begin at the same moment of the machine's monotonic clock, in every process and actor.
 
         Returns:
             For each client its calls that ended after `begin`.
         """
         acting = list(zip(self._agents, self._ranks, strict=True))[:active]
-        if hz is None:
-            made = [self._pool.submit(self._act, *each, begin, end) for each in acting]
-        else:
-            phase = random.Random(os.getpid())  # other phases in each process
-            made = [
-                self._pool.submit(self._pace, agent, begin + phase.uniform(0, 1 / hz), end, hz) for agent, _ in acting
-            ]
-        return [one.result() for one in made]
+        return [one.result() for one in [self._pool.submit(self._act, *each, begin, end) for each in acting]]
 
     def close(self) -> None:
         for agent in self._agents:
@@ -186,17 +176,6 @@ class LoadGenerator:
             ended = time.monotonic()
             if begin <= ended < end:
                 calls.append((ended, timing["round_trip_ms"], timing["inference_ms"], int(timing["batch_size"])))
-        return calls
-
-    def _pace(self, agent: RemoteAgent, tick: float, end: float, hz: float) -> list[Call]:
-        """Act at `tick`, s, and at each further one that does not pass during an act."""
-        calls = []
-        while tick < end:
-            time.sleep(max(0.0, tick - time.monotonic()))
-            timing = agent.act(self._obs).info["timing"]
-            ended = time.monotonic()
-            calls.append((ended, 1e3 * (ended - tick), timing["inference_ms"], int(timing["batch_size"])))
-            tick += max(1, math.ceil((ended - tick) * hz)) / hz
         return calls
 
 
