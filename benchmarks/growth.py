@@ -25,8 +25,7 @@ from benchmarks.autoscaling import check_plot_file
 from benchmarks.console import Json, parse_counts, save
 from benchmarks.drivers import START_S
 from benchmarks.figures import measured_on
-from benchmarks.processes import UsageMeter, server_processes
-from benchmarks.round_trips import IDLE_S
+from benchmarks.processes import UsageMeter, count_idle, server_processes
 from vlagents_ray.bench.line_process import LineProcess, our_environment
 from vlagents_ray.cli.console import errors, out, progress, table
 from vlagents_ray.errors import ConfigError
@@ -100,10 +99,7 @@ def _point(plan: GrowthPlan, server: Server, sessions: int, hz: float) -> dict[s
         run(_WARM_S)
         pids = [one.pid for one in clients]
         used, served = UsageMeter(pids), UsageMeter(server_processes(os.getpid(), pids))
-        with used.counting(), served.counting():
-            time.sleep(IDLE_S)
-        used.mark_idle()
-        idle_server_cores = served.mark_idle()
+        _, idle_server_cores = count_idle([used, served])
         with used.counting(), served.counting():
             ms = run(plan.seconds)
     return {

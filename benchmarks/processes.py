@@ -16,6 +16,7 @@ DAEMONS = frozenset(
     {"gcs_server", "raylet", "ServeController", "DashboardAgent", "RuntimeEnvAgent", "IDLE"}
     | {"dashboard.py", "agent.py", "main.py", "monitor.py", "log_monitor.py", "ray.util.client.server"}
 )
+_IDLE_S = 3.0
 _SWITCHES = re.compile(r"ctxt_switches:\t(\d+)")  # voluntary ones, then involuntary ones
 
 
@@ -111,6 +112,15 @@ class UsageMeter:
             "involuntary_switches": involuntary,  # the machine had other work
             "programs": programs,
         }
+
+
+def count_idle(meters: Sequence[UsageMeter]) -> list[float]:
+    """Count for 3 s while all processes are idle, as their use while idle; returns the CPU s a second of each meter."""
+    with contextlib.ExitStack() as stack:
+        for meter in meters:
+            stack.enter_context(meter.counting())
+        time.sleep(_IDLE_S)
+    return [meter.mark_idle() for meter in meters]
 
 
 def _counters(pid: int) -> tuple[float, dict[str, tuple[int, ...]]] | None:

@@ -13,7 +13,6 @@ import contextlib
 import os
 import random
 import tempfile
-import time
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass, field
@@ -25,7 +24,7 @@ import numpy as np
 from benchmarks.drivers import Driver, ProcessDriver
 from benchmarks.figures import RoundTrips, lost_db, ratios
 from benchmarks.own_clients import OwnClient, connected, observation, save_observation
-from benchmarks.processes import UsageMeter, descendants, server_processes
+from benchmarks.processes import UsageMeter, count_idle, server_processes
 from vlagents_ray.errors import ConfigError
 from vlagents_ray.interface import Obs
 from vlagents_ray.policies.noop import Noop
@@ -37,8 +36,6 @@ LOOPBACK = "127.0.0.1"
 ROUND = 100  # calls of one client in its turn
 UNBROKEN = 200  # rounds' worth of calls without a break: a second or two
 ON_NODE = ("shm", "plasma")
-
-IDLE_S = 3.0  # s in which the use of idle processes is counted
 
 StartClient = Callable[[Path], AbstractContextManager[ProcessDriver]]  # given the file of the observation
 
@@ -85,7 +82,7 @@ class MeteredDriver:
 
     def __init__(self, driver: ProcessDriver, server: Sequence[int]) -> None:
         self._driver, self._acts = driver, 0
-        self.client, self.server = UsageMeter([driver.pid, *descendants(driver.pid)]), UsageMeter(server)
+        self.client, self.server = UsageMeter([driver.pid]), UsageMeter(server)
 
     def ready(self) -> dict[str, Any]:
         """Return nothing: the driver is ready."""
@@ -107,20 +104,13 @@ def metered(drivers: Mapping[str, ProcessDriver]) -> dict[str, MeteredDriver]:
     """Count what the acts of ready drivers use beyond the use of the same processes while all are idle."""
     others = [pid for one in drivers.values() for pid in (one.pid, one.server_pid) if pid is not None]
     ours = server_processes(os.getpid(), others)
-    found = {
-        name: MeteredDriver(
-            one, ours if one.server_pid is None else [one.server_pid, *server_processes(one.server_pid)]
-        )
-        for name, one in drivers.items()
-    }
-    with contextlib.ExitStack() as stack:
-        for one in found.values():
-            stack.enter_context(one.server.counting())
-            stack.enter_context(one.client.counting())
-        time.sleep(IDLE_S)
-    for one in found.values():
-        one.server.mark_idle()
-        one.client.mark_idle()
+    found = {}
+    for name, one in drivers.items():
+        server = ours
+        if one.server_pid is not None:
+            server = sorted({one.server_pid, *server_processes(one.server_pid)} - {one.pid})
+        found[name] = MeteredDriver(one, server)
+    count_idle([meter for one in found.values() for meter in (one.client, one.server)])
     return found
 
 
