@@ -14,7 +14,7 @@ import numpy as np
 # Ray's processes that do nothing for an act: `program` of each, some before they have set their title.
 DAEMONS = frozenset(
     {"gcs_server", "raylet", "ServeController", "DashboardAgent", "RuntimeEnvAgent", "IDLE"}
-    | {"dashboard.py", "agent.py", "main.py", "monitor.py", "log_monitor.py", "ray.util.client.server"}
+    | {"default_worker.py", "dashboard.py", "agent.py", "main.py", "monitor.py", "log_monitor.py"}
 )
 _IDLE_S = 3.0
 _SWITCHES = re.compile(r"ctxt_switches:\t(\d+)")  # voluntary ones, then involuntary ones
@@ -34,8 +34,11 @@ def cpu_seconds(pid: int) -> float:
 
 
 def program(pid: int) -> str:
-    """Return the name of a process: Ray's title for it, a script, or a program."""
-    words = Path(f"/proc/{pid}/cmdline").read_bytes().decode(errors="replace").split("\0")
+    """Return the name of a process: Ray's title for it, a script, or a program; empty if it has ended."""
+    try:
+        words = Path(f"/proc/{pid}/cmdline").read_bytes().decode(errors="replace").split("\0")
+    except OSError:
+        return ""
     if title := re.match(r"ray::(\w+)", words[0]):
         return title[1]
     return Path(next((word for word in words if word.endswith(".py")), words[0])).name
@@ -63,12 +66,7 @@ def server_processes(root: int, others: Collection[int] = ()) -> list[int]:
         others: Further processes that `root` has started; neither these nor their descendants belong to the server.
     """
     strangers = {*others}.union(*(descendants(one) for one in others))
-    found = []
-    for pid in sorted(descendants(root) - strangers):
-        with contextlib.suppress(OSError):  # it has ended
-            if program(pid) not in DAEMONS:
-                found.append(pid)
-    return found
+    return [pid for pid in sorted(descendants(root) - strangers) if program(pid) not in DAEMONS]
 
 
 class UsageMeter:
