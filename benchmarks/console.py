@@ -43,6 +43,36 @@ def show_round_trips(found: Mapping[str, Any], title: str) -> None:
     show_skipped(found)
 
 
+USE_COLUMNS = (
+    "client CPU ms", "server CPU ms", "acts/s of a server's core", "server's programs, CPU ms", "client waits",
+    "server waits", "preempted",
+)  # fmt: skip
+
+
+def use_cells(use: Mapping[str, Any]) -> list[str]:
+    """Return the cells of `USE_COLUMNS` for what an act uses of client and server."""
+    client, server = use["client"], use["server"]
+    programs = sorted(server["programs"].items(), key=lambda one: -one[1])
+    return [
+        f"{client['cpu_ms']:.3f}",
+        f"{server['cpu_ms']:.3f}",
+        f"{1e3 / server['cpu_ms']:.0f}" if server["cpu_ms"] > 0 else "",
+        ", ".join(f"{name} {cpu_ms:.3f}" for name, cpu_ms in programs if cpu_ms >= 0.01 * server["cpu_ms"]),
+        f"{client['voluntary_switches']:.1f}",
+        f"{server['voluntary_switches']:.1f}",
+        f"{client['involuntary_switches'] + server['involuntary_switches']:.1f}",
+    ]
+
+
+def show_use(found: Mapping[str, Any]) -> None:
+    """Print a row for each client: what an act uses of its process and of its server's processes."""
+    rows = table("way", *USE_COLUMNS)
+    rows.title = "CPU time and context switches of one act, beyond those of idle processes"
+    for name, use in sorted(found["use"].items(), key=lambda one: float(one[1]["server"]["cpu_ms"])):
+        rows.add_row(name, *use_cells(use))
+    out.print(rows)
+
+
 def show_skipped(found: Mapping[str, Any]) -> None:
     """Print the skipped clients with the reasons."""
     for name, reason in found["skipped"].items():

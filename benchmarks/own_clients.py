@@ -9,6 +9,7 @@ import contextlib
 import functools
 import inspect
 import json
+import os
 import sys
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -19,7 +20,7 @@ from typing import Any, get_args
 import numpy as np
 
 from benchmarks.closed_loop import Call, ClosedLoop
-from benchmarks.drivers import CALL_S, START_S, ClientProcess, Driver
+from benchmarks.drivers import CALL_S, START_S, ClientProcess, ProcessDriver
 from vlagents_ray.bench.line_client import WARM_UP, die_with_parent, obey, own_stdout, timed
 from vlagents_ray.bench.line_process import our_environment
 from vlagents_ray.client.agent import RemoteAgent
@@ -113,7 +114,11 @@ class BenchCaller:
         self._agent = connect(url, transport, codec)
         self._obs = observation()
         info = self._agent.reset(self._obs, "measure")
-        self.description: dict[str, Any] = {"transport": self._agent.transport, "psnr_db": info.get("psnr_db")}
+        self.description: dict[str, Any] = {
+            "transport": self._agent.transport,
+            "psnr_db": info.get("psnr_db"),
+            "pid": os.getpid(),
+        }
 
     def measure(self, calls: int) -> list[float]:
         return timed(lambda: self._obs, self._agent.act, calls)
@@ -156,16 +161,19 @@ class LoadGenerator:
         return timing["round_trip_ms"], timing["inference_ms"], int(timing["batch_size"])
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(slots=True)
 class ActorDriver:
     """A client in a Ray actor, as rollouts are."""
 
     actor: Any
+    pid: int = 0  # of the actor's process, once it is ready
+    server_pid: int | None = None
 
     def ready(self) -> dict[str, Any]:
         import ray
 
         said: dict[str, Any] = ray.get(self.actor.ready.remote(), timeout=START_S)
+        self.pid = said["pid"]
         return said
 
     def measure(self, calls: int) -> list[float]:
@@ -176,7 +184,7 @@ class ActorDriver:
 
 
 @contextlib.contextmanager
-def connected(client: OwnClient, url: str, app: str, prefix: Sequence[str] = ()) -> Iterator[Driver]:
+def connected(client: OwnClient, url: str, app: str, prefix: Sequence[str] = ()) -> Iterator[ProcessDriver]:
     """Start a client of ours to the server at `url`; its command begins with `prefix`."""
     if client.actor:
         import ray

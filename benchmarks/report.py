@@ -15,7 +15,7 @@ import typer
 from rich.text import Text
 
 from benchmarks import link
-from benchmarks.console import Calls
+from benchmarks.console import USE_COLUMNS, Calls, use_cells
 from benchmarks.figures import measured_on
 from benchmarks.peers import PYTHON, PeersPython
 from benchmarks.picture import plot_league
@@ -205,8 +205,10 @@ def replaced(text: str, section: str) -> str:
 def section(results: Mapping[str, Any]) -> str:
     """Return the text between the markers: targets, round trips, the link, throughput, and their origin."""
     parts = [_origin(results), _targets(outcomes(results))]
-    if results.get("rtt"):
+    if rtt := results.get("rtt"):
         parts.append(_league(results))
+        if use := rtt.get("use"):
+            parts.append(_use(use))
     if link := results.get("link"):
         name = (
             f"The same over a link of {link['link']['measured_mbit_per_s']:.0f} Mbit/s between two network namespaces"
@@ -300,6 +302,15 @@ def _round_trips(title: str, part: Mapping[str, Any]) -> str:
             )
         )
     return f"{title}:\n\n" + _table(("", "median ms", "p99 ms", *(f"/ {peer}" for peer in theirs)), rows)
+
+
+def _use(use: Results) -> str:
+    rows = [(name, *use_cells(one)) for name, one in sorted(use.items(), key=lambda one: one[1]["server"]["cpu_ms"])]
+    text = (
+        "CPU time of the same acts, beyond that of the idle processes, and how often a thread of client or server "
+        "waited or was preempted:"
+    )
+    return f"{text}\n\n{_table(('', *USE_COLUMNS), rows)}"
 
 
 def _throughput(part: Results) -> str:

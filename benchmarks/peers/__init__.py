@@ -22,7 +22,7 @@ from typing import Annotated, Any
 
 import typer
 
-from benchmarks.drivers import START_S, ClientProcess, Driver
+from benchmarks.drivers import START_S, ClientProcess, ProcessDriver
 from benchmarks.round_trips import LOOPBACK, StartClient
 from vlagents_ray.bench.line_process import LineProcess
 from vlagents_ray.errors import ConfigError
@@ -215,11 +215,12 @@ def peer_connected(
     *,
     host: str = LOOPBACK,
     prefix: Sequence[str] = (),
-) -> Iterator[Driver]:
+) -> Iterator[ProcessDriver]:
     """Run a peer's server on `host`, and its client, whose command begins with `prefix`, within a context."""
     with serving(client, python, running, {}, host=host) as server:
         command = [*prefix, *client.command(python), "drive", *server.address, str(obs), client.mode, "{}"]
         with _PeerDriver(server, client.name, command) as process:
+            process.server_pid = process.pid if server.process is None else server.process.pid
             yield process
 
 

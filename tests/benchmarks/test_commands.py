@@ -8,7 +8,7 @@ import pytest
 import typer
 from typer.testing import CliRunner
 
-from benchmarks import autoscaling, evaluation, far_away, hop, policy, report, rtt, scaling, success, throughput
+from benchmarks import autoscaling, evaluation, far_away, growth, hop, policy, report, rtt, scaling, success, throughput
 from benchmarks.checkpoints import __main__ as checkpoints
 
 
@@ -22,6 +22,8 @@ from benchmarks.checkpoints import __main__ as checkpoints
         (evaluation, ["--episodes", "5"], "multiple of the 2 workers"),
         (evaluation, ["--peers", "nobody"], "nobody"),
         (far_away, ["--modes", "async,nobody"], "nobody"),
+        (growth, ["--sessions", "few"], "few"),
+        (growth, ["--transport", "handle"], "handle"),
         (hop, ["--python", "nowhere"], "nowhere"),
         (report, ["--page", "nowhere.md"], "nowhere.md"),
         (policy, ["noop", "--batch", "0"], "from 1"),

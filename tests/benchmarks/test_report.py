@@ -17,6 +17,11 @@ def way(name: str, ms: float, psnr: float | None = None) -> dict[str, Any]:
     return {"way": name, "calls": 500, "median_ms": ms, "ci95_ms": [ms, ms + 0.01], "p99_ms": 2 * ms, "psnr_db": psnr}
 
 
+def use(ms: float) -> dict[str, Any]:
+    programs = {"haproxy": 0.25 * ms, "ServeReplica": 0.75 * ms, "HAProxyManager": 0.001 * ms}
+    return {"cpu_ms": ms, "voluntary_switches": 2.0, "involuntary_switches": 0.04, "programs": programs}
+
+
 def round_trips(ours: dict[str, float], theirs: dict[str, float]) -> dict[str, Any]:
     ratios = {
         a: {b: {"ratio": x / y, "ci95": [x / y - 0.01, x / y + 0.01]} for b, y in theirs.items()}
@@ -39,6 +44,7 @@ RESULTS: dict[str, Any] = {
             THEIRS,
         ),
         "skipped": {"vla-eval": "not installed"},
+        "use": {name: {"client": use(1.25), "server": use(ms)} for name, ms in (("http, jpeg", 0.8), ("openpi", 0.5))},
         "steady": [way("plasma, Ray actor", 0.1), {**way("shm", 0.1), "p99_ms": 0.31}],
     },
     "link": {
@@ -100,6 +106,9 @@ def test_the_section_names_machine_date_versions_and_command() -> None:
     assert "| *openpi* | 0.600 (0.600 to 0.610) | 1.20 | 5.45 | 47 (46 to 48) |  |  |  |" in text
     assert "| *openpi* | 0.100 | 47 (46 to 48) | 47 (46 to 48) |  |" in text
     assert "a link of 953 Mbit/s" in text
+    openpi = "| openpi | 1.250 | 0.500 | 2000 | ServeReplica 0.375, haproxy 0.125 | 2.0 | 2.0 | 0.1 |"
+    assert openpi in text
+    assert text.index(openpi) < text.index("| http, jpeg | 1.250 | 0.800 | 1250 |")
 
 
 def test_what_was_not_measured_is_said() -> None:
