@@ -99,6 +99,7 @@ PEER_CLIENTS = (
 PEERS = tuple(dict.fromkeys(one.peer for one in PEER_CLIENTS))
 Policy = Mapping[str, float]  # arguments of `peer.Policy`
 ALONE = {"PYTHONPATH": ""}  # nothing of ours in a peer's environment
+READY_S = 240.0  # some import torch, or start Ray, several processes at once
 
 
 def peer_clients(names: Sequence[str], python: Path) -> tuple[list[PeerClient], dict[str, str], dict[str, str]]:
@@ -175,7 +176,8 @@ class _PeerDriver(ClientProcess):
 
     def ready(self) -> dict[str, Any]:
         with self._server.turn():
-            return super().ready()
+            said: dict[str, Any] = self.read(READY_S)
+            return said
 
     def measure(self, calls: int) -> list[float]:
         with self._server.turn():

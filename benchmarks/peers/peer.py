@@ -40,7 +40,7 @@ else:  # the peers' Python has no vlagents_ray: files are loaded by their paths
 
 __all__ = ["Client", "Policy", "Target", "die_with_parent", "run", "wait_for_port"]
 
-_START_S = 60.0
+_START_S = 180.0
 
 if Path(sys.argv[0]).resolve().parent == Path(__file__).resolve().parent:  # also in processes that a script spawns
     die_with_parent()
@@ -123,7 +123,7 @@ def _stdin_has_ended() -> bool:
 
 
 def wait_for_port(host: str, port: int) -> None:
-    """Wait until a server listens; `TimeoutError` after a minute. Ends this process if its input ends."""
+    """Wait until a server listens; `TimeoutError` after three minutes. Ends this process if its input ends."""
     deadline = time.monotonic() + _START_S
     while True:
         try:
