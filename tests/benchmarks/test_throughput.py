@@ -44,11 +44,15 @@ def test_too_few_calls_have_no_rate() -> None:
 
 
 def test_robots_think_and_a_late_answer_ends_a_client() -> None:
+    def prompt() -> tuple[float, float, int]:
+        time.sleep(0.001)
+        return 3.0, 1.0, 4
+
     def late() -> tuple[float, float, int]:
         time.sleep(0.3)
         raise TimeoutError
 
-    loop = ClosedLoop([lambda: (2.0, 1.0, 1), lambda: (3.0, 1.0, 4), late], robots=1)
+    loop = ClosedLoop([prompt, prompt, late], robots=1)
     begin = time.monotonic()
     robot, simulation, ended = loop.run(1, 2, begin, begin + 0.2)
     assert 0 < len(robot) < len(simulation)
