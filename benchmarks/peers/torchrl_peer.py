@@ -47,7 +47,8 @@ def _server(target: peer.Target) -> InferenceServer:
 
 def connect(target: peer.Target) -> peer.Client:
     """Make a client of TorchRL."""
-    client, obs = _server(target).client(), _observation(target)
+    (client,) = _server(target).clients(1)  # its `client` returns the same one each time
+    obs = _observation(target)
     return peer.Client(lambda: obs, lambda obs: client(obs)["action"].numpy())
 
 
