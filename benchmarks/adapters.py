@@ -28,7 +28,7 @@ from vlagents_ray.interface import Act, Agent, Obs
 from vlagents_ray.policies.base import ModelPolicy
 from vlagents_ray.registry import policy_class
 from vlagents_ray.serve.models.agent_copies import AgentCopies
-from vlagents_ray.testing.agents import random_observation
+from vlagents_ray.testing import random_observation
 from vlagents_ray.weights.safetensors import header_of, parts_of
 
 ADAPTERS, MODELS, BASE = "adapters", "models", "base alone"

@@ -33,10 +33,10 @@ from vlagents_ray.cli.console import errors, out, progress, table
 from vlagents_ray.cli.options import Set, StateDims, parse_dims, parse_settings
 from vlagents_ray.contract import Contract
 from vlagents_ray.errors import ConfigError
-from vlagents_ray.interface import Act, Agent, Obs
+from vlagents_ray.interface import Agent, Obs
 from vlagents_ray.policies.wrapper import build_agent
 from vlagents_ray.serve.config.deployment import ServerArgs
-from vlagents_ray.testing.agents import random_observation
+from vlagents_ray.testing import random_observation
 
 
 @dataclass(frozen=True, slots=True)
@@ -78,11 +78,6 @@ class BareAndQueued(MeasuredPolicy):
             "batch_ms": statistics.median(times) * 1e3,
             "network_ms": network_ms,
         }
-
-    def batch(self, episodes: Sequence[int]) -> Callable[[], list[Act]]:
-        """Return a function that acts once with sessions of these episodes, in one batch."""
-        views, sessions = [self._view(self.engine.contract, i) for i in episodes], self._sessions(episodes)
-        return lambda: self._act(views, sessions)
 
 
 def measure_policy(plan: PolicyPlan, progress: Callable[[str], None] = lambda _: None) -> dict[str, Any]:

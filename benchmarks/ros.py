@@ -24,7 +24,7 @@ from vlagents_ray.images.jpeg_png import encode_jpeg
 from vlagents_ray.robot import Guard
 from vlagents_ray.robot.ros import RosRobot
 from vlagents_ray.robot.ros.links import Ros2
-from vlagents_ray.robot.ros.settings import settings_from
+from vlagents_ray.robot.ros.robot import settings_from
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "tests/support"))
 

@@ -46,11 +46,16 @@ from vlagents_ray.weights.safetensors import read_values, write_values
 
 STANDARD = "eager, in this process"
 APP = "reference"
-EXECUTE = 4  # rows of a chunk of 8
+CHUNK, EXECUTE = 8, 4  # rows
 TOGETHER = 16  # episodes of a batch
 QUALITIES = (30, 50, 70, 85, 95)  # of JPEG; 85 is the client's
 DELAYS = (0.0, 0.05, 0.15)  # s
 HZ = 20.0  # of the clock at those delays: none, one and three ticks
+LATE: dict[str, dict[str, Any]] = {  # what is executed meanwhile: nothing, the old plan, or what the new one continues
+    "stop and wait": {"meanwhile": "zero"},
+    "async": {},
+    "real-time chunking": {"real_time_chunking": True},
+}
 _RAW = ImageCodec("raw")
 _ADAPTED = "context"  # the layer with an adapter of rank 4 of random weights, small enough that success remains
 _KEYS = {
@@ -121,11 +126,11 @@ def ways() -> list[Way]:
         *(Way(f"JPEG, quality {one}", transport="websocket", codec=ImageCodec("jpeg", one)) for one in QUALITIES),
         Way("after a push", transport="shm", pushed=True, equal=True),
         *(Way(f"upstream, {name}", upstream=name) for name in PROTOCOLS),
-        Way("open loop, all 8 rows", execute=8),
+        Way(f"open loop, all {CHUNK} rows", execute=CHUNK),
         Way("ensemble", {"actions": "ensemble"}, execute=1),
-        *(Way(f"async, {1000 * s:.0f} ms", clock=ClockConfig(latency=s, hz=HZ)) for s in DELAYS),
         *(
-            Way(f"real-time chunking, {1000 * s:.0f} ms", clock=ClockConfig(latency=s, hz=HZ, real_time_chunking=True))
+            Way(f"{name}, {1000 * s:.0f} ms", clock=ClockConfig(latency=s, hz=HZ, **settings))
+            for name, settings in LATE.items()
             for s in DELAYS
         ),
         Way("LoRA apart", adapter=True),
@@ -189,15 +194,14 @@ class Players:
     def _behind(self, protocol: str) -> Agent:
         host, ports = self._serve()
         url, mapping = PROTOCOLS[protocol]
-        rows = 1 if protocol == "vla_eval" else EXECUTE
-        contract = {"action": {"dim": 4}, "chunk": rows}
+        contract = {"action": {"dim": 4}, "chunk": 1 if protocol == "vla_eval" else CHUNK}
         config = {"protocol": protocol, "urls": [url.format(host=host, **ports)], "contract": contract}
         return Upstream.from_config(config | {"mapping": mapping})
 
     def _config(self, way: Way) -> dict[str, Any]:
         checkpoint = self._merged() if way.merged else self._checkpoint
         adapters = {"adapters": {"own": str(self._adapter())}} if way.adapter else {}
-        return {"checkpoint": str(checkpoint), "embodiment": "tabletop", "execute": way.execute} | adapters | way.config
+        return {"checkpoint": str(checkpoint), "embodiment": "tabletop"} | adapters | way.config
 
     def _serve(self) -> tuple[str, dict[str, int]]:
         if self._server is None:
@@ -257,10 +261,11 @@ class Players:
         return folder
 
 
-def compared(standard: Played, others: Sequence[Played]) -> list[dict[str, Any]]:
-    """Return a row for each way: its rate, its difference from the standard, and its equal episodes."""
-    pairs = [_pairs(one, standard) for one in others]
-    adjusted = holm([pair.p_value for pair in pairs])
+def compared(found: Sequence[Played]) -> list[dict[str, Any]]:
+    """Return a row for each way: its rate, its difference from the first, and its equal episodes."""
+    standard = found[0]
+    pairs = [_pairs(one, standard) for one in found]
+    adjusted = [1.0, *holm([pair.p_value for pair in pairs[1:]])]
     return [
         {
             "way": one.way.name,
@@ -274,7 +279,7 @@ def compared(standard: Played, others: Sequence[Played]) -> list[dict[str, Any]]
             "equal": sum(one.episodes[seed][1] == standard.episodes[seed][1] for seed in standard.episodes),
             "must_be_equal": one.way.equal,
         }
-        for one, pair, p in zip(others, pairs, adjusted, strict=True)
+        for one, pair, p in zip(found, pairs, adjusted, strict=True)
     ]
 
 
@@ -321,7 +326,7 @@ def main(
                 out.print(f"{way.name}: skipped: {error}", style="yellow")
             else:
                 out.print(f"{way.name}: {found[-1].solved} of {len(found[-1].episodes)}")
-        rows = compared(found[0], found)
+        rows = compared(found)
         out.print(shown(rows))
         save({"ways": rows, "skipped": skipped}, json_file)
         if broken := [row["way"] for row in rows if row["must_be_equal"] and row["equal"] < row["episodes"]]:

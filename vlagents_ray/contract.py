@@ -8,6 +8,7 @@ simulator that renders upside down rotates them.
 
 from __future__ import annotations
 
+import json
 from collections.abc import Iterator, Mapping
 from dataclasses import asdict, dataclass, field, fields
 from itertools import combinations
@@ -15,7 +16,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from vlagents_ray.errors import ContractMismatch, MalformedMessage
+from vlagents_ray.errors import ConfigError, ContractMismatch, MalformedMessage
 from vlagents_ray.naming import says_its_fields
 
 _MOST_PARTS = 12  # of the env's state, whose combinations are tried
@@ -56,9 +57,8 @@ class ActionSpec:
     gripper_closed: float | None = None  # the value that closes it
     low: float | None = None  # lower bound of every number
     high: float | None = None  # upper bound of every number
-    arms: tuple[str, ...] | None = (
-        None  # names of several arms in the row's order: the command of each, then its gripper
-    )
+    # Names of several arms in the row's order: the command of each, then its gripper.
+    arms: tuple[str, ...] | None = None
 
     @property
     def relative(self) -> bool | None:
@@ -89,7 +89,8 @@ class Contract:
         stated = asdict(self)
         if self.behaviour is None:
             del stated["behaviour"]  # only policies for learners state it
-        return {key: _plain(value) for key, value in stated.items()}
+        plain: dict[str, Any] = json.loads(json.dumps(stated, default=np.generic.item))
+        return plain
 
     @classmethod
     def from_json(cls, data: object) -> Contract:
@@ -101,14 +102,14 @@ class Contract:
         Raises:
             MalformedMessage: The document has an unknown key or a value of a wrong type.
         """
-        top = _closed(cls, data, "contract")
+        top = closed(cls, data, "contract")
         for name, spec in (("cameras", CameraSpec), ("state", StateSpec)):
             if top.get(name) is not None:
                 if not isinstance(top[name], dict):
                     raise MalformedMessage(f"contract.{name}: got {type(top[name]).__name__}, want an object")
-                top[name] = {str(k): spec(**_closed(spec, v, f"contract.{name}.{k}")) for k, v in top[name].items()}
+                top[name] = {str(k): spec(**closed(spec, v, f"contract.{name}.{k}")) for k, v in top[name].items()}
         if "action" in top:
-            action = _closed(ActionSpec, top["action"], "contract.action")
+            action = closed(ActionSpec, top["action"], "contract.action")
             top["action"] = ActionSpec(**{**action, "arms": _names(action.get("arms"), "contract.action.arms")})
         return cls(**{**top, "behaviour": _names(top.get("behaviour"), "contract.behaviour")})
 
@@ -121,17 +122,21 @@ def _names(value: object, where: str) -> tuple[str, ...] | None:
     return None
 
 
-def _plain(value: Any) -> Any:
-    if isinstance(value, Mapping):
-        return {key: _plain(item) for key, item in value.items()}
-    if isinstance(value, tuple):
-        return list(value)
-    return value.item() if isinstance(value, np.generic) else value
-
-
 def differences(policy: Contract, env: Contract) -> list[str]:
     """List the differences between the contracts of a policy and an env, one sentence each with its cure."""
-    found = [*_camera_differences(policy, env), *_state_differences(policy, env)]
+    found, given = [], env.cameras or {}
+    for name, need in ((policy.cameras or {}) if env.cameras is not None else {}).items():
+        if (have := given.get(name)) is None:
+            found.append(
+                f"camera {name!r}: the policy needs it, the env gives {sorted(given)}; "
+                f"add or rename a camera of the env"
+            )
+        elif _differ(need.height, have.height) or _differ(need.width, have.width):
+            found.append(
+                f"camera {name!r}: the policy needs {need.height}x{need.width} pixels (height x width), "
+                f"the env gives {have.height}x{have.width}; set the env's camera size"
+            )
+    found += _state_differences(policy, env)
     if policy.gripper and env.gripper is False:
         found.append("gripper: the policy needs Obs.gripper, which the env does not provide; fill it, 1 = open")
     if policy.instruction and env.instruction is False:
@@ -154,23 +159,6 @@ def _differ(a: object, b: object) -> bool:
     return a is not None and b is not None and a != b
 
 
-def _camera_differences(policy: Contract, env: Contract) -> Iterator[str]:
-    if env.cameras is None:
-        return
-    for name, need in (policy.cameras or {}).items():
-        have = env.cameras.get(name)
-        if have is None:
-            yield (
-                f"camera {name!r}: the policy needs it, the env gives {sorted(env.cameras)}; "
-                f"add or rename a camera of the env"
-            )
-        elif _differ(need.height, have.height) or _differ(need.width, have.width):
-            yield (
-                f"camera {name!r}: the policy needs {need.height}x{need.width} pixels (height x width), "
-                f"the env gives {have.height}x{have.width}; set the env's camera size"
-            )
-
-
 def _state_differences(policy: Contract, env: Contract) -> Iterator[str]:
     if env.state is None:
         return
@@ -185,12 +173,10 @@ def _state_differences(policy: Contract, env: Contract) -> Iterator[str]:
             )
             continue
         if _differ(need.dim, have.dim):
-            yield (f"state {name!r}: the policy needs {need.dim} numbers, the env gives {have.dim}; {cure or _ANOTHER}")
+            cure = cure or "is this another task's or robot's policy?"
+            yield f"state {name!r}: the policy needs {need.dim} numbers, the env gives {have.dim}; {cure}"
         if _differ(need.unit, have.unit):
             yield f"state {name!r}: the policy needs {need.unit!r}, the env gives {have.unit!r}; convert it"
-
-
-_ANOTHER = "is this another task's or robot's policy?"
 
 
 def _parts_cure(dim: int | None, env: Contract) -> str:
@@ -240,18 +226,17 @@ _ACTION_CURES = {
 
 def require_match(policy: Contract | None, env: Contract | None) -> None:
     """Raise `ContractMismatch` with every difference between the contracts of a policy and an env."""
-    if policy is None or env is None:
-        return
-    found = differences(policy, env)
-    if found:
+    if policy is not None and env is not None and (found := differences(policy, env)):
         raise ContractMismatch("policy and env do not fit:\n" + "\n".join(f"- {line}" for line in found))
 
 
-def _closed(cls: type, data: object, where: str) -> dict[str, Any]:
+def closed(
+    cls: type, data: object, where: str, error: type[MalformedMessage | ConfigError] = MalformedMessage
+) -> dict[str, Any]:
+    """Return the entries of `data`; raise `error` unless it is a mapping with only fields of the dataclass `cls`."""
     if not isinstance(data, Mapping):
-        raise MalformedMessage(f"{where}: got {type(data).__name__}, want an object")
-    known = {f.name for f in fields(cls)}
-    unknown = set(map(str, data)) - known
-    if unknown:
-        raise MalformedMessage(f"{where}: unknown keys {sorted(unknown)}, want some of {sorted(known)}")
-    return {str(k): v for k, v in data.items()}
+        raise error(f"{where}: got {type(data).__name__}, want an object")
+    known = [one.name for one in fields(cls)]
+    if unknown := sorted(str(key) for key in data if key not in known):
+        raise error(f"{where}: unknown keys {unknown}, want some of {sorted(known)}")
+    return dict(data)

@@ -152,9 +152,7 @@ def state_parts(
 
 def wanted_parts(policy: Contract | None) -> list[str]:
     """Return the parts of the state that a policy's contract names, "gripper" for `Obs.gripper` last."""
-    if policy is None:
-        return []
-    return [*(policy.state or {}), *([GRIPPER] if policy.gripper else [])]
+    return [] if policy is None else [*(policy.state or {}), *([GRIPPER] if policy.gripper else [])]
 
 
 def divided_state(
@@ -191,9 +189,7 @@ def angles_in(part: str, unit: str | None, dim: int) -> range:
         return range(0)
     if unit == "rad":
         return range(dim)
-    if unit == "m+rad" and dim == 6:  # x, y, z, roll, pitch, yaw
-        return range(3, 6)
-    return range(0)
+    return range(3, 6) if unit == "m+rad" and dim == 6 else range(0)  # x, y, z, roll, pitch, yaw
 
 
 def rotation_vector_in(part: str, unit: str | None, dim: int) -> int | None:
@@ -231,8 +227,7 @@ def centre_of(episodes: Sequence[np.ndarray]) -> float | None:
     circle = np.sort(values)
     arcs = np.diff(circle, append=circle[0] + _TURN)
     widest = int(arcs.argmax())
-    opposite = circle[widest] + arcs[widest] / 2 + math.pi
-    return round(float(_near(np.array(opposite), 0.0)), 6)
+    return round(float(_near(np.array(circle[widest] + arcs[widest] / 2 + math.pi), 0.0)), 6)
 
 
 def rotation_centre_of(episodes: Sequence[np.ndarray]) -> tuple[float, float, float] | None:

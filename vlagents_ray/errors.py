@@ -2,49 +2,27 @@
 
     VLAgentsError
     ├── InvalidInput (also ValueError)      the request is wrong; sending it again will not help
-    │   ├── MalformedMessage     400        the bytes cannot be decoded
-    │   ├── MessageTooLarge      413        a body, an image or a nesting exceeds the server's limit
-    │   ├── InvalidObservation   422        a wrong shape, type or value
-    │   │   ├── MissingCamera    422
-    │   │   ├── MissingState     422
-    │   │   └── NotOffered       422        `info["want"]` names an unknown value
-    │   ├── UnknownSession       404        expired, closed, or never reset
-    │   ├── UnknownApp           404        no such application on this server
-    │   ├── UnknownCheckpoint    400        the deployment does not offer the checkpoint named in a reset
-    │   ├── NotReset             409        `act` before `reset`
-    │   ├── ContractMismatch     409        robot or env and policy do not fit together
-    │   ├── InvalidWeights       422        pushed weights do not fit the policy
-    │   ├── UnchangedWeights     409        pushed weights equal those that the policy holds
-    │   ├── NotTrainable         409        the policy names no parameters that could be replaced
-    │   ├── WeightsNotStaged     409        the version of weights to be served is not held here
-    │   ├── Unauthorized         401        the API key is missing, unknown, revoked or expired
-    │   └── Forbidden            403        the API key is not for this application
-    ├── Overloaded               503        too many requests in flight; not executed, so send it again later
-    ├── TooManyRequests          429        the rate or the sessions of the API key are exceeded
-    ├── PolicyFailed             500        the policy raised an exception
-    │   ├── InvalidAction        500        the policy returned an unusable action
-    │   └── CheckpointFailed     500        the checkpoint named in a reset did not load
-    ├── PolicyUnavailable        503        the server is not ready, is restarting, is full, or not reachable
-    │   ├── NoReplica            503        no replica runs; the proxy answers this and executed nothing
-    │   └── ConnectionLost       503        the connection broke; the request may have been executed
-    ├── DeadlineExceeded         504        no answer in time (also TimeoutError); if a server raised it, not executed
-    │   └── OutcomeUnknown       504        the deadline passed during inference: the session counts the step
-    ├── ConfigError (also ValueError)       a setting is unknown, missing or contradictory
-    │   ├── UnknownPolicy
-    │   │   └── UnknownWrapper
-    │   ├── UnknownEnv
-    │   └── WeightsLost                     the policy acts with weights other than those that were pushed
-    ├── EnvFailed                           a simulator failed: infrastructure, never the policy
-    ├── StorageFailed                       results cannot be written: a full disk, no permission
-    ├── ClusterLost                         the head of the Ray cluster no longer answers
-    └── MissingDependency (also ImportError)
+    │   ├── MalformedMessage, MessageTooLarge
+    │   ├── InvalidObservation              MissingCamera, MissingState, NotOffered
+    │   ├── UnknownSession, UnknownApp, UnknownCheckpoint, NotReset, ContractMismatch
+    │   ├── InvalidWeights, UnchangedWeights, NotTrainable, WeightsNotStaged
+    │   └── Unauthorized, Forbidden
+    ├── Overloaded, TooManyRequests         not executed; send it again later
+    ├── PolicyFailed                        InvalidAction, CheckpointFailed
+    ├── PolicyUnavailable                   NoReplica, ConnectionLost
+    ├── DeadlineExceeded (also TimeoutError)
+    │   └── OutcomeUnknown
+    ├── ConfigError (also ValueError)       UnknownPolicy (UnknownWrapper), UnknownEnv, WeightsLost
+    └── EnvFailed, StorageFailed, ClusterLost, MissingDependency (also ImportError)
 
-`code` is stable; a server sends it in a problem+json document, with `status` as the HTTP status. A message states the
-received and the expected value, and the cure.
+`code` is stable: by default the name of the class, "unknown_session" of `UnknownSession`. A server sends it in a
+problem+json document, with `status` as the HTTP status. A message states the received and the expected value, and the
+cure.
 """
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterable
 from itertools import islice
 from typing import ClassVar, Literal
@@ -89,7 +67,6 @@ class VLAgentsError(Exception):
 class InvalidInput(VLAgentsError, ValueError):
     """The request or argument is wrong; sending it again will not help."""
 
-    code = "invalid_input"
     status = 400
 
 
@@ -109,14 +86,11 @@ class MessageTooLarge(InvalidInput):
 class InvalidObservation(InvalidInput):
     """An observation has a wrong shape, type or value (e.g. NaN), or lacks what the policy's contract names."""
 
-    code = "invalid_observation"
     status = 422
 
 
 class MissingCamera(InvalidObservation):
     """The policy's contract names a camera that the observation lacks."""
-
-    code = "missing_camera"
 
     def __init__(self, name: str, have: Iterable[str] = ()) -> None:
         super().__init__(f"camera {name!r} is missing: got {sorted(have)}; send it, or rename one of yours to {name!r}")
@@ -125,8 +99,6 @@ class MissingCamera(InvalidObservation):
 class MissingState(InvalidObservation):
     """The policy's contract names a part of the proprioception that the observation lacks."""
 
-    code = "missing_state"
-
     def __init__(self, name: str, have: Iterable[str] = ()) -> None:
         super().__init__(f"state {name!r} is missing: got {sorted(have)}; send it, or rename one of yours to {name!r}")
 
@@ -134,89 +106,74 @@ class MissingState(InvalidObservation):
 class NotOffered(InvalidObservation):
     """The observation's `info["want"]` names a value that the policy's contract does not list under `behaviour`."""
 
-    code = "not_offered"
-
 
 class UnknownSession(InvalidInput):
     """The session expired, was closed, was on a replica that has ended, or was never reset."""
 
-    code = "unknown_session"
     status = 404
 
 
 class UnknownApp(InvalidInput):
     """The server has no application at this name or path."""
 
-    code = "unknown_app"
     status = 404
 
 
 class UnknownCheckpoint(InvalidInput):
     """A reset named a checkpoint that the deployment does not offer; the message lists the offered ones."""
 
-    code = "unknown_checkpoint"
-
 
 class NotReset(InvalidInput):
     """`act` was called before `reset` in this session."""
 
-    code = "not_reset"
     status = 409
 
 
 class ContractMismatch(InvalidInput):
     """The policy and the robot or env do not fit together; the message lists every difference."""
 
-    code = "contract_mismatch"
     status = 409
 
 
 class InvalidWeights(InvalidInput):
     """Pushed weights have an unknown or missing name, another shape or type, or a value that is not finite."""
 
-    code = "invalid_weights"
     status = 422
 
 
 class UnchangedWeights(InvalidInput):
     """Pushed weights equal those that the policy holds, so that probably the wrong ones were pushed."""
 
-    code = "unchanged_weights"
     status = 409
 
 
 class NotTrainable(InvalidInput):
     """The policy names no parameters that could be replaced while it is served."""
 
-    code = "not_trainable"
     status = 409
 
 
 class WeightsNotStaged(InvalidInput):
     """The version of weights to be served was never staged here, or was dropped since its learner was silent."""
 
-    code = "weights_not_staged"
     status = 409
 
 
 class Unauthorized(InvalidInput):
     """The request has no API key, or one that is unknown, revoked or expired."""
 
-    code = "unauthorized"
     status = 401
 
 
 class Forbidden(InvalidInput):
     """The API key is valid, but not for this application."""
 
-    code = "forbidden"
     status = 403
 
 
 class TooManyRequests(VLAgentsError):
     """The requests or sessions of the API key exceed its limits; the request was not executed."""
 
-    code = "too_many_requests"
     status = 429
     retry_after_s: float = 1.0  # seconds until the next request is accepted
 
@@ -224,7 +181,6 @@ class TooManyRequests(VLAgentsError):
 class Overloaded(VLAgentsError):
     """The replica has no memory left for the request, which was not executed: send it again later."""
 
-    code = "overloaded"
     status = 503
     retry_after_s: float = 1.0  # seconds to wait before the next attempt
 
@@ -232,13 +188,9 @@ class Overloaded(VLAgentsError):
 class PolicyFailed(VLAgentsError):
     """The policy raised an exception while it was initialized, reset, or computing an action."""
 
-    code = "policy_failed"
-
 
 class InvalidAction(PolicyFailed):
     """The policy returned an action that must not reach a robot: not an array, a wrong shape, or NaN."""
-
-    code = "invalid_action"
 
     def __init__(self, *args: object, cause: Literal["invalid", "limits", "max_step", "leader"] = "invalid") -> None:
         super().__init__(*args)
@@ -247,8 +199,6 @@ class InvalidAction(PolicyFailed):
 
 class CheckpointFailed(PolicyFailed):
     """The checkpoint named in a reset did not load; others keep working, and the next reset tries to load it again."""
-
-    code = "checkpoint_failed"
 
 
 class PolicyUnavailable(VLAgentsError):
@@ -265,26 +215,19 @@ class NoReplica(PolicyUnavailable):
     Clients raise it also if nothing accepts connections at the server's address.
     """
 
-    code = "no_replica"
-
 
 class ConnectionLost(PolicyUnavailable):
     """The connection broke during a request, which may or may not have been executed."""
-
-    code = "connection_lost"
 
 
 class DeadlineExceeded(VLAgentsError, TimeoutError):
     """No answer arrived within the caller's deadline; a request that a server answers with this was not executed."""
 
-    code = "deadline_exceeded"
     status = 504
 
 
 class OutcomeUnknown(DeadlineExceeded):
     """The deadline passed during inference: the session has taken the step, or is about to."""
-
-    code = "outcome_unknown"
 
 
 class ConfigError(VLAgentsError, ValueError):
@@ -296,49 +239,33 @@ class ConfigError(VLAgentsError, ValueError):
 class WeightsLost(ConfigError):
     """The policy acts with other weights than the learner's: it was restarted since the push, or not pushed to."""
 
-    code = "weights_lost"
-
 
 class UnknownPolicy(ConfigError):
     """No policy is registered under this name."""
-
-    code = "unknown_policy"
 
 
 class UnknownWrapper(UnknownPolicy):
     """No wrapper is registered under this name."""
 
-    code = "unknown_wrapper"
-
 
 class UnknownEnv(ConfigError):
     """No environment is registered under this name."""
-
-    code = "unknown_env"
 
 
 class EnvFailed(VLAgentsError):
     """A simulator failed or hung: an infrastructure failure, never counted as the policy's."""
 
-    code = "env_failed"
-
 
 class StorageFailed(VLAgentsError):
     """Results cannot be written, e.g. to a full disk or a read-only folder; results written before are kept."""
-
-    code = "storage_failed"
 
 
 class ClusterLost(VLAgentsError):
     """The head of the Ray cluster no longer answers, and nothing can run without it."""
 
-    code = "cluster_lost"
-
 
 class MissingDependency(VLAgentsError, ImportError):
     """An optional package is not installed; the message names the extra or the requirements file with it."""
-
-    code = "missing_dependency"
 
 
 def _tree(cls: type[VLAgentsError]) -> Iterable[type[VLAgentsError]]:
@@ -346,6 +273,10 @@ def _tree(cls: type[VLAgentsError]) -> Iterable[type[VLAgentsError]]:
     for sub in cls.__subclasses__():
         yield from _tree(sub)
 
+
+for _error in _tree(VLAgentsError):
+    if "code" not in vars(_error):
+        _error.code = re.sub(r"\B(?=[A-Z])", "_", _error.__name__).lower()
 
 BY_CODE: dict[str, type[VLAgentsError]] = {cls.code: cls for cls in _tree(VLAgentsError)}
 

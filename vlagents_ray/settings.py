@@ -43,42 +43,25 @@ def require_arguments(what: str, function: Callable[..., Any], given: Mapping[st
         unknown = (name for name in given if name not in takes)
         meant = next(filter(None, (did_you_mean(name, takes) for name in unknown)), "")
         raise ConfigError(f"{what}: {error}; it takes {sorted(takes)}{meant}") from error
-    annotations = _annotations(function)
+    annotated = function.__init__ if isinstance(function, type) else function  # type: ignore[misc]
+    try:
+        annotations = get_type_hints(annotated)
+    except (NameError, TypeError, AttributeError):  # they name types that cannot be found
+        annotations = {}
     for name, value in given.items():
         parameter = signature.parameters.get(name)
         if parameter is None or value is parameter.default:  # a value for **kwargs, or the default itself
             continue
-        kinds = _kinds(annotations[name]) if name in annotations else _kinds_of_default(parameter.default)
-        if kinds and not any(_is(value, kind) for kind in kinds):
+        default = parameter.default  # without an annotation, the default 1 allows 0.5 as well
+        own = Any if default is None else float if type(default) is int else type(default)
+        annotation: Any = annotations.get(name, own)
+        kinds = list(get_args(annotation)) if get_origin(annotation) in (Union, UnionType) else [annotation]
+        if not all(isinstance(kind, type) and kind in _PLAIN for kind in kinds):
+            continue
+        # A boolean does not count as a number.
+        if not any(isinstance(value, _PLAIN[kind]) and (kind is bool or type(value) is not bool) for kind in kinds):
             wanted = " or ".join("None" if kind is type(None) else kind.__name__ for kind in kinds)
             raise ConfigError(f"{what}: {name}: got {value!r}, want {wanted}")
-
-
-def _annotations(function: Callable[..., Any]) -> Mapping[str, Any]:
-    """Return the annotations of the parameters; an empty mapping if they name types that cannot be found."""
-    annotated = function.__init__ if isinstance(function, type) else function  # type: ignore[misc]
-    try:
-        return get_type_hints(annotated)
-    except (NameError, TypeError, AttributeError):
-        return {}
-
-
-def _kinds(annotation: Any) -> list[type]:
-    """List the plain types that an annotation allows; empty if it allows any other type."""
-    kinds = list(get_args(annotation)) if get_origin(annotation) in (Union, UnionType) else [annotation]
-    return kinds if all(isinstance(kind, type) and kind in _PLAIN for kind in kinds) else []
-
-
-def _kinds_of_default(default: Any) -> list[type]:
-    """List the plain types for a parameter without annotation; the default 1 allows 0.5 as well."""
-    if isinstance(default, (int, float)) and not isinstance(default, bool):
-        return [float]
-    return [type(default)] if isinstance(default, (bool, str)) else []
-
-
-def _is(value: Any, kind: type) -> bool:
-    """Return whether a value is of a plain type; a boolean does not count as a number."""
-    return isinstance(value, _PLAIN[kind]) and (kind is bool or not isinstance(value, bool))
 
 
 def wrong_settings(error: ValueError, model: type | None = None, option: str | None = None) -> str:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 
 import numpy as np
 
@@ -32,19 +31,16 @@ def check_observation(obs: Obs, contract: Contract | None) -> None:
     if obs.gripper is not None and not 0.0 <= obs.gripper <= 1.0:
         raise InvalidObservation(f"gripper: got {obs.gripper}, want a number in [0, 1] where 1 = open")
     if WANT in obs.info:
-        _check_wanted(obs.info[WANT], (contract and contract.behaviour) or ())
+        wanted, offered = obs.info[WANT], (contract and contract.behaviour) or ()
+        if not isinstance(wanted, list) or not all(isinstance(name, str) for name in wanted):
+            raise InvalidObservation(f"info[{WANT!r}]: got {_describe(wanted)}, want a list of names")
+        if unknown := sorted(set(wanted) - set(offered)):
+            raise NotOffered(
+                f"info[{WANT!r}]: got {unknown}, want some of {sorted(offered)}, the `behaviour` of the policy's "
+                f"contract; take a policy that returns it, or leave it out"
+            )
     if contract is not None and (contract.cameras or contract.state or contract.gripper):
         _check_needs(obs, contract)
-
-
-def _check_wanted(wanted: object, offered: Sequence[str]) -> None:
-    if not isinstance(wanted, list) or not all(isinstance(name, str) for name in wanted):
-        raise InvalidObservation(f"info[{WANT!r}]: got {_describe(wanted)}, want a list of names")
-    if unknown := sorted(set(wanted) - set(offered)):
-        raise NotOffered(
-            f"info[{WANT!r}]: got {unknown}, want some of {sorted(offered)}, the `behaviour` of the policy's contract; "
-            f"take a policy that returns it, or leave it out"
-        )
 
 
 def _check_needs(obs: Obs, contract: Contract) -> None:
@@ -90,6 +86,4 @@ def _finite(array: np.ndarray) -> bool:
 
 
 def _describe(value: object) -> str:
-    if isinstance(value, np.ndarray):
-        return f"{value.shape} {value.dtype}"
-    return type(value).__name__
+    return f"{value.shape} {value.dtype}" if isinstance(value, np.ndarray) else type(value).__name__

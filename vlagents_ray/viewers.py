@@ -69,12 +69,6 @@ class ViewerFrame:
         return cls(tick, **{"time": obs.info.get(CAPTURED, time.time()), **what}, cameras=cameras, state=state)
 
 
-def numbers_of(info: Mapping[str, Any]) -> dict[str, float]:
-    """Return the numbers in the info of an `Act` that viewers show: its timing, and the fields of a chunk player."""
-    timing = info.get("timing") or {}
-    return {**timing, **{name: float(info[name]) for name in (AGE, SILENT) if name in info}}
-
-
 class RerunRecordings:
     """Writes a recording of each episode, on the timelines `tick` and `time`.
 
@@ -84,11 +78,12 @@ class RerunRecordings:
 
     def __init__(self, target: str) -> None:
         """Write `TARGET/EPISODE.rrd`, or send to the viewer at an address; see `open_viewer`."""
-        if "://" in target and not is_live(target):
+        is_live = target == "live" or target.startswith("rerun+")
+        if "://" in target and not is_live:
             raise ConfigError(f"rerun: got {target!r}, want a folder, 'live', or an address such as {LIVE}")
         self.target = LIVE if target == "live" else target
         self._rerun = require("rerun")
-        self._folder = None if is_live(target) else Path(target)
+        self._folder = None if is_live else Path(target)
         self.closing_s = CLOSING_S if self._folder is None else None
         """Time limit, s, for writing the remaining frames when it is closed; None for no limit."""
         if self._folder is None:
@@ -167,11 +162,6 @@ def open_viewer(target: str) -> EpisodeViewer:
         MissingDependency: The extra "rerun" is not installed.
     """
     return EpisodeViewer(RerunRecordings(target))
-
-
-def is_live(target: str) -> bool:
-    """Return whether a target is a connection instead of a folder."""
-    return target == "live" or target.startswith("rerun+")
 
 
 class EpisodeViewer:
@@ -283,8 +273,12 @@ class LoopView:
         self._note = ""
 
     def episode(self, instruction: str) -> contextlib.AbstractContextManager[None]:
-        """Show the frames added within the context as one episode."""
-        return contextlib.nullcontext() if self._viewer is None else self._viewer.episode(dated_name(), instruction)
+        """Show the frames added within the context as one episode, with its time (UTC) as its name."""
+        if self._viewer is None:
+            return contextlib.nullcontext()
+        now = time.time()
+        name = f"{time.strftime('%Y%m%d_%H%M%S', time.gmtime(now))}_{int(now * 1e3) % 1000:03d}"
+        return self._viewer.episode(name, instruction)
 
     def add(self, obs: Obs, act: Act, executed: np.ndarray | None, tick: int, work_s: float, stop: str = "") -> None:
         """Show a tick with the time that the loop worked, `work_s`, and the reason of a stop; never waits."""
@@ -303,14 +297,13 @@ class LoopView:
             executed=None if executed is None else np.array(executed),
             planned=info.get(WANTED) if rows is None else rows[info["row"]],
             chunk=None if rows is self._chunk else rows,
-            numbers={**numbers_of(info), "work_ms": work_s * 1e3, **{name: float(on) for name, on in spells.items()}},
+            numbers={
+                **(info.get("timing") or {}),
+                **{name: float(info[name]) for name in (AGE, SILENT) if name in info},
+                "work_ms": work_s * 1e3,
+                **{name: float(on) for name, on in spells.items()},
+            },
             note=note if note != self._note else "",
         )
         self._chunk, self._note = self._chunk if rows is None else rows, note
         viewer.add(frame)
-
-
-def dated_name(when: float | None = None) -> str:
-    """Return a name for an episode that begins now, or at a time in s since 1970: 20270131_183000_250 (UTC)."""
-    when = time.time() if when is None else when
-    return f"{time.strftime('%Y%m%d_%H%M%S', time.gmtime(when))}_{int(when * 1e3) % 1000:03d}"

@@ -29,7 +29,7 @@ from vlagents_ray.registry import require
 from vlagents_ray.serve.engine.engine import Engine
 from vlagents_ray.serve.models.checkpoints import Checkpoints
 from vlagents_ray.serve.requests import RANKS, PendingRequest
-from vlagents_ray.testing.agents import random_observation
+from vlagents_ray.testing import random_observation
 
 CAMERAS = {"base_0_rgb": "front", "left_wrist_0_rgb": "wrist", "right_wrist_0_rgb": "right_wrist"}
 INSTRUCTION = "pick up the cube"

@@ -13,7 +13,7 @@ from colours import BINS, WORDS, named_colour, places
 from torch import nn
 
 from vlagents_ray.contract import Contract
-from vlagents_ray.envs.tabletop.env import Tabletop
+from vlagents_ray.envs.tabletop import Tabletop
 from vlagents_ray.errors import MissingCamera, MissingState
 from vlagents_ray.interface import BEHAVIOUR, WANT, Act, Agent, Obs
 

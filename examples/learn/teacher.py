@@ -8,7 +8,7 @@ import numpy as np
 from colours import named_colour, puck_position
 
 from vlagents_ray.contract import Contract
-from vlagents_ray.envs.tabletop.env import Tabletop
+from vlagents_ray.envs.tabletop import Tabletop
 from vlagents_ray.errors import MissingCamera, MissingState, NotReset
 from vlagents_ray.interface import Act, Agent, Obs
 

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from vlagents_ray.bench.measured_policy import load_observations, save_observations
 from vlagents_ray.bench.tuner import (
     GoalMissed,
     MeasuredPoint,
@@ -21,7 +22,6 @@ from vlagents_ray.bench.tuner import (
     largest_difference,
     recorded_observations,
 )
-from vlagents_ray.bench.tuning_process import load_observations, save_observations
 from vlagents_ray.errors import ConfigError
 from vlagents_ray.evaluate import Trajectory
 from vlagents_ray.images.mp4 import Mp4

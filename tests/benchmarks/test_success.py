@@ -54,8 +54,9 @@ def test_the_difference_is_that_of_paired_episodes() -> None:
         return success.Played(success.Way(name), {seed: (one, f"{name}{one}") for seed, one in enumerate(solved)}, 1.0)
 
     standard = of("a", *[True] * 8, False, False)
-    same, worse = success.compared(standard, [standard, of("b", *[False] * 8, False, True)])
+    same, again, worse = success.compared([standard, standard, of("b", *[False] * 8, False, True)])
     assert (same["difference"], same["p_holm"], same["equal"]) == (0.0, 1.0, 10)
+    assert again == same
     assert (worse["solved"], worse["only_a"], worse["only_b"], worse["equal"]) == (1, 1, 8, 0)
     assert worse["p_value"] == pytest.approx(20 / 512)  # (1 + 9) / 2^9, twice
     assert worse["p_holm"] == pytest.approx(2 * 20 / 512)

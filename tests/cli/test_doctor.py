@@ -17,7 +17,7 @@ from rich.console import Console
 
 from vlagents_ray.cli import doctor
 from vlagents_ray.cli.doctor import Check
-from vlagents_ray.envs import render_probe
+from vlagents_ray.envs import graphics
 from vlagents_ray.envs.graphics import EglDevice
 from vlagents_ray.errors import MissingDependency
 from vlagents_ray.serve.ports import free_port
@@ -210,8 +210,8 @@ def test_a_machine_on_which_workers_without_a_gpu_could_not_render_is_told(
     monkeypatch: pytest.MonkeyPatch, software: bool, status: str
 ) -> None:
     devices = (EglDevice(0, software=False, cuda=0), *([EglDevice(1, software=True, cuda=None)] if software else []))
-    found = render_probe.RenderProbe("egl", ok=True, seconds=1.0, device="NVIDIA H200/PCIe/SSE2", devices=devices)
-    monkeypatch.setattr(render_probe, "egl_probe", lambda: found)
+    found = graphics.RenderProbe("egl", ok=True, seconds=1.0, device="NVIDIA H200/PCIe/SSE2", devices=devices)
+    monkeypatch.setattr(graphics, "egl_probe", lambda: found)
     row = doctor.egl()
     assert row.status == status
     assert ("gpus: 0.25" in row.cure) is not software

@@ -11,8 +11,7 @@ from pathlib import Path
 import pytest
 
 from vlagents_ray.envs import graphics
-from vlagents_ray.envs.graphics import EGL_DEVICE, GPUS, EglDevice, Renderer, fitting, require_own
-from vlagents_ray.envs.render_probe import usable_devices
+from vlagents_ray.envs.graphics import EGL_DEVICE, GPUS, EglDevice, Renderer, fitting, require_own, usable_devices
 from vlagents_ray.envs.robosuite import importing_robosuite
 from vlagents_ray.errors import ConfigError, EnvFailed
 

@@ -7,8 +7,7 @@ import numpy as np
 import pytest
 
 from vlagents_ray.envs.base import SequentialBatch, make_batch
-from vlagents_ray.envs.maniskill import ManiSkill
-from vlagents_ray.envs.maniskill.env import ManiSkillBatch
+from vlagents_ray.envs.maniskill import ManiSkill, ManiSkillBatch
 from vlagents_ray.errors import ConfigError, NotReset
 from vlagents_ray.interface import Act
 from vlagents_ray.policies.experts import expert_class

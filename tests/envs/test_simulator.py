@@ -16,7 +16,7 @@ from vlagents_ray.envs.simulator import BenchmarkProtocol, SimulatorEnv
 from vlagents_ray.errors import ConfigError, EnvFailed, InvalidAction, NotReset
 from vlagents_ray.interface import Act, Obs
 from vlagents_ray.registry import ENVS
-from vlagents_ray.testing.comparing import require_wireable
+from vlagents_ray.testing import require_wireable
 
 PAGES = Path(__file__).parents[2] / "docs" / "benchmarks"
 ANY_PROTOCOL = {"tabletop", "gymnasium"}  # our own example, and environments of others by their ids

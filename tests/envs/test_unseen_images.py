@@ -43,7 +43,7 @@ def test_simpler() -> None:
 
 @pytest.mark.vulkan
 def test_a_simulator_that_runs_its_environments_together() -> None:
-    from vlagents_ray.envs.maniskill.env import ManiSkillBatch
+    from vlagents_ray.envs.maniskill import ManiSkillBatch
     from vlagents_ray.interface import Act
 
     with ManiSkillBatch("PickCube-v1", num_envs=1, sim_backend="physx_cpu", **SMALL) as batch:

@@ -102,6 +102,7 @@ def test_a_killed_replica_costs_no_flight(server: Server, transport: TransportNa
         for i, row in enumerate(inputs[:300, 0]):
             if i == 200:
                 os.kill(pid, signal.SIGKILL)
+                wait_for(lambda: not psutil.pid_exists(pid))
             act = agent.act(observation(row))
             assert ("resumed" in act.info) == (i == 200), i
             assert np.abs(act.action - wanted[i, 0]).max() < TOLERANCE, i

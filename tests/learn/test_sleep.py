@@ -214,7 +214,7 @@ def test_all_memory_on_the_gpu_moves_to_the_host_and_back(
         raise torch.OutOfMemoryError("CUDA out of memory. Tried to allocate 2.00 GiB")
 
     with monkeypatch.context() as patch:
-        patch.setattr("vlagents_ray.serve.weights.from_host", full)
+        patch.setattr(trainable, "from_host", full)
         with pytest.raises(PolicyUnavailable, match="too little memory for the policy, which still sleeps"):
             weights.wake()
     assert calls == [3], "weight, bias, and the bias of version 1"

@@ -27,10 +27,10 @@ from train import ENV_OPTIONS, LearnPlan, Method, RunCheckpoints
 
 from vlagents_ray import Act, Agent, Obs
 from vlagents_ray.cli.options import read_run_file
-from vlagents_ray.envs.tabletop.env import Tabletop
+from vlagents_ray.envs.tabletop import Tabletop
 from vlagents_ray.errors import ConfigError, InvalidObservation, MissingCamera
 from vlagents_ray.interface import BEHAVIOUR, WANT
-from vlagents_ray.testing.agents import check_agent
+from vlagents_ray.testing import check_agent
 
 pytestmark = pytest.mark.torch
 

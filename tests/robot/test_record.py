@@ -22,7 +22,6 @@ from vlagents_ray import ConfigError, Obs
 from vlagents_ray.contract import ActionSpec, CameraSpec, Contract, StateSpec
 from vlagents_ray.dataset_contract import BYTES, INFO, STATISTICS, DatasetContract
 from vlagents_ray.errors import InvalidObservation
-from vlagents_ray.robot import dataset
 from vlagents_ray.robot.dataset import Dataset
 from vlagents_ray.robot.record import Recorder
 
@@ -239,18 +238,18 @@ def test_a_kill_at_any_moment_of_a_save_leaves_nothing_of_its_episode(
 ) -> None:
     root, expected = tmp_path / "dataset", tmp_path / "expected"
     killed: list[Path] = []
-    move = dataset._move
+    move = Dataset._move
 
-    def moved(part: Path, path: Path) -> None:
+    def moved(self: Dataset, part: Path, path: Path) -> None:
         killed.append(tmp_path / f"killed-{len(killed)}")
         shutil.copytree(root, killed[-1])
-        move(part, path)
+        move(self, part, path)
 
     record(root, 5)
     record(expected, 5)
     record(expected, 7, "stack the plates")
     with monkeypatch.context() as patched:
-        patched.setattr(dataset, "_move", moved)
+        patched.setattr(Dataset, "_move", moved)
         record(root, 9, "unstack the cups")
     assert killed[-1].joinpath("meta/stats.json").read_bytes() != killed[0].joinpath("meta/stats.json").read_bytes()
     for left in killed:

@@ -13,8 +13,7 @@ import pytest
 
 from vlagents_ray import Act, Agent, Obs
 from vlagents_ray.contract import ActionSpec, Contract, StateSpec
-from vlagents_ray.testing import ContractViolation, check_agent
-from vlagents_ray.testing.comparing import difference, require_wireable
+from vlagents_ray.testing import ContractViolation, check_agent, difference, require_wireable
 
 CONTRACT = Contract(state={"joints": StateSpec(2)}, action=ActionSpec(dim=2))
 

@@ -11,7 +11,7 @@ import tempfile
 import time
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import IO, Any, cast
 
 from typing_extensions import Self
 
@@ -44,19 +44,17 @@ class LineProcess:
             env={**os.environ, **(environment or {})},
             start_new_session=True,  # Ctrl-C goes to the bench, which ends its children in order
         )
+        self._input, self._output = cast(IO[bytes], self._process.stdin), cast(IO[bytes], self._process.stdout)
         self.pid = self._process.pid
 
     def read(self, timeout_s: float) -> Any:
         """Read the next line that the process writes, decoded; raises `ProcessFailed` on its end or a time-out."""
-        stream = self._process.stdout
-        if stream is None:
-            raise ProcessFailed(f"{self.name}: has no standard output")
         deadline = time.monotonic() + timeout_s
         while b"\n" not in self._received:
-            ready, _, _ = select.select([stream], [], [], max(0.0, deadline - time.monotonic()))
+            ready, _, _ = select.select([self._output], [], [], max(0.0, deadline - time.monotonic()))
             if not ready:
                 raise ProcessFailed(f"{self.name}: no answer within {timeout_s:g} s\n{self._last_errors()}".rstrip())
-            more = os.read(stream.fileno(), 2**16)
+            more = os.read(self._output.fileno(), 2**16)
             if not more:
                 with contextlib.suppress(subprocess.TimeoutExpired):
                     self._process.wait(_END_S)
@@ -71,11 +69,9 @@ class LineProcess:
 
     def send(self, line: str) -> None:
         """Send a line, without waiting for the answer."""
-        if self._process.stdin is None:
-            raise ProcessFailed(f"{self.name}: has no standard input")
         with contextlib.suppress(BrokenPipeError):  # `read` raises the reason
-            self._process.stdin.write(line.encode() + b"\n")
-            self._process.stdin.flush()
+            self._input.write(line.encode() + b"\n")
+            self._input.flush()
 
     def request(self, line: str, timeout_s: float) -> Any:
         self.send(line)
@@ -83,16 +79,14 @@ class LineProcess:
 
     def close(self) -> None:
         """Close the standard input of the process, which ends it; kill it if it continues."""
-        if self._process.stdin is not None:
-            with contextlib.suppress(OSError):
-                self._process.stdin.close()
+        with contextlib.suppress(OSError):
+            self._input.close()
         try:
             self._process.wait(self._end_s)
         except subprocess.TimeoutExpired:
             self._process.kill()
             self._process.wait()
-        if self._process.stdout is not None:
-            self._process.stdout.close()
+        self._output.close()
         self._errors.close()
 
     def __enter__(self) -> Self:

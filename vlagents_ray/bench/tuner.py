@@ -16,7 +16,7 @@ from typing import Any, Literal, get_args
 import numpy as np
 
 from vlagents_ray.bench.line_process import LineProcess, ProcessFailed, our_environment
-from vlagents_ray.bench.tuning_process import FRAMES, ProcessSettings, save_observations
+from vlagents_ray.bench.measured_policy import FRAMES, ProcessSettings, save_observations
 from vlagents_ray.errors import ConfigError, VLAgentsError
 from vlagents_ray.evaluate.artifacts.recorder import Trajectory, videos_of
 from vlagents_ray.interface import Obs
@@ -215,7 +215,22 @@ class Tuner:
             most = max(rates, key=rates.__getitem__) if self._plan.goal.kind == "throughput" else max(rates)
             variants = self._variants(ready, sorted(size for size in rates if size <= most))
             for number, variant in enumerate(variants):
-                self._try(variant, frames, parts=len(variants) - number)
+                if any(failed.changes.items() <= variant.changes.items() for failed in self._failed):
+                    continue
+                if time.monotonic() >= self._end:
+                    self.left_out.append(f"{variant.name}: no time was left")
+                    continue
+                sizes = self._plan.args.batch.sizes or variant.changes.get("batch_sizes") or self._candidates()
+                try:
+                    with self._loaded(variant, frames) as (process, ready):
+                        for what in ready["uncompiled"]:
+                            self.left_out.append(f"{variant.name}: not compiled: {what}")
+                        if variant.changes.get("compile") and len(ready["uncompiled"]) == len(sizes):
+                            raise VariantFailed("no size could be compiled")
+                        self._sweep(process, variant, sizes, parts=len(variants) - number)
+                except VariantFailed as error:
+                    self._failed.append(variant)
+                    self.left_out.append(f"{variant.name}: {error}")
         return [size.point() for size in self._sizes]
 
     def _measure_own(self, frames: Path | None) -> Mapping[str, Any]:
@@ -257,25 +272,6 @@ class Tuner:
         both = [one | other for other in compiled for one in dtypes]
         return [Variant(changes) for changes in [*dtypes, *compiled, *both]]
 
-    def _try(self, variant: Variant, frames: Path | None, parts: int) -> None:
-        """Measure a variant, or report its failure."""
-        if any(failed.changes.items() <= variant.changes.items() for failed in self._failed):
-            return
-        if time.monotonic() >= self._end:
-            self.left_out.append(f"{variant.name}: no time was left")
-            return
-        sizes = self._plan.args.batch.sizes or variant.changes.get("batch_sizes") or self._candidates()
-        try:
-            with self._loaded(variant, frames) as (process, ready):
-                for what in ready["uncompiled"]:
-                    self.left_out.append(f"{variant.name}: not compiled: {what}")
-                if variant.changes.get("compile") and len(ready["uncompiled"]) == len(sizes):
-                    raise VariantFailed("no size could be compiled")
-                self._sweep(process, variant, sizes, parts)
-        except VariantFailed as error:
-            self._failed.append(variant)
-            self.left_out.append(f"{variant.name}: {error}")
-
     @contextmanager
     def _loaded(self, variant: Variant, frames: Path | None) -> Iterator[tuple[LineProcess, Mapping[str, Any]]]:
         """Yield the process of a loaded variant, and its report."""
@@ -292,7 +288,7 @@ class Tuner:
             dims=self._plan.dims,
         )
         found = our_environment() if environment.python is None else {}
-        command = [environment.python or sys.executable, "-m", "vlagents_ray.bench.tuning_process"]
+        command = [environment.python or sys.executable, "-m", "vlagents_ray.bench.measured_policy"]
         with LineProcess("tune", command, found | environment.env_vars, end_s=_END_S) as process:
             process.send(json.dumps(asdict(settings)))
             said = self._answer(process)
@@ -358,8 +354,7 @@ class Tuner:
 
     def _actions(self, process: LineProcess, size: int) -> list[np.ndarray]:
         process.send(json.dumps({"act": size}))
-        said = self._answer(process)
-        return [np.array(action, np.float64) for action in said["actions"]]
+        return [np.array(action, np.float64) for action in self._answer(process)["actions"]]
 
     def _turn(self, process: LineProcess, number: int) -> dict[str, Any]:
         rank = "robot" if self._plan.goal.kind == "robots" else "simulation"

@@ -131,8 +131,7 @@ class ChunkBuffer:
 
     def take(self) -> Step:
         """Return `next` and count it as executed; raises `PolicyFailed` if no chunk reaches that far."""
-        step = self.next
-        if step is None:
+        if (step := self.next) is None:
             raise PolicyFailed(f"chunk: no row is left for step {self.executed} of the plan")
         self.advance()
         return step
@@ -156,11 +155,9 @@ class ChunkBuffer:
 
     def drop(self, before: float = math.inf) -> bool:
         """Drop chunks with observations from before a time, s of `time.monotonic`; return whether there were any."""
-        kept = [chunk for chunk in self._chunks if chunk.seen_at >= before]
-        dropped = len(kept) < len(self._chunks)
-        if dropped:
-            self._chunks = deque(kept)
-        return dropped
+        count, kept = len(self._chunks), deque(chunk for chunk in self._chunks if chunk.seen_at >= before)
+        self._chunks = kept
+        return len(kept) < count
 
     def _at(self, place: int) -> Step | None:
         for newest in reversed(self._chunks):

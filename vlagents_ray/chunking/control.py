@@ -172,8 +172,7 @@ class Control:
             try:
                 engaged = self.leader.engaged()
             except Exception as error:  # noqa: BLE001 - a broken device must not end the loop
-                own = isinstance(error, VLAgentsError)
-                self.pause(str(error) if own else f"the leader failed: {error!r}")
+                self.pause(str(error) if isinstance(error, VLAgentsError) else f"the leader failed: {error!r}")
         with self._lock:
             before = self._state
             if engaged and not self._engaged and pauses == self._pauses:  # no pause since the takeover

@@ -96,7 +96,18 @@ class SafeAction:
         if isinstance(safe, str):
             if safe not in get_args(SafeName):
                 raise ConfigError(f"safe: got {safe!r}, want one of {list(get_args(SafeName))}, an array or a function")
-            self._make: Safe = _fitting(safe, spec)
+            if spec.relative is None and safe != "hold":
+                raise ConfigError(
+                    f"safe: got {safe!r}, and the policy's contract does not say whether its actions are relative or "
+                    "absolute; state it (ActionSpec.delta), or give safe='hold', which is right for absolute ones "
+                    "alone, or an action of your own"
+                )
+            self._make: Safe = stopping(spec)
+            if safe not in ("auto", self._make):
+                moves = (
+                    "absolute ones take for a pose to go to" if safe == "zero" else "relative actions go on moving with"
+                )
+                raise ConfigError(f"safe: got {safe!r}, which {moves}; give safe={self._make!r}, or 'auto'")
         else:
             self._make = safe if callable(safe) else np.asarray(safe, np.float32)
         self._grippers = list(grippers) if grippers is not None else [-1] if spec.gripper_open is not None else []
@@ -150,20 +161,6 @@ def neutral(spec: ActionSpec, dim: int | None = None) -> np.ndarray:
     if spec.gripper_open is not None:
         action[-1] = spec.gripper_open
     return action
-
-
-def _fitting(safe: SafeName, spec: ActionSpec) -> SafeName:
-    if spec.relative is None and safe != "hold":
-        raise ConfigError(
-            f"safe: got {safe!r}, and the policy's contract does not say whether its actions are relative or absolute; "
-            "state it (ActionSpec.delta), or give safe='hold', which is right for absolute ones alone, "
-            "or an action of your own"
-        )
-    fitting = stopping(spec)
-    if safe not in ("auto", fitting):
-        moves = "relative actions go on moving with" if fitting == "zero" else "absolute ones take for a pose to go to"
-        raise ConfigError(f"safe: got {safe!r}, which {moves}; give safe={fitting!r}, or 'auto'")
-    return fitting
 
 
 Check = Callable[[np.ndarray, "np.ndarray | None"], np.ndarray]

@@ -298,8 +298,7 @@ class ChunkPlayer(Agent):
 
     def act(self, obs: Obs) -> Act:
         """Return the action of this tick, (D,) float32."""
-        tick = self._tick
-        if tick is None:
+        if (tick := self._tick) is None:
             raise NotReset("act before reset; reset first")
         begun = time.monotonic()
         self._motion.tick()
@@ -330,14 +329,25 @@ class ChunkPlayer(Agent):
         self._begin()
 
     def _ask(self, obs: Obs, tick: int, begun: float) -> None:
-        """Take the policy's answer if there is one, and send the next request if it is due."""
-        if self._asker is None or self.settings.deadline_s is None:
+        """Take the policy's answer, send the next request if it is due, and wait as long as allowed and needed."""
+        asker = self._asker
+        if asker is None or self.settings.deadline_s is None:
             if self._wants(tick, obs):
                 self._note_asked(tick, obs)
                 self._take(self._agent.act(stamped(obs, self._extras())), tick)
         else:  # no tick waits for an action that will not be executed
-            wait_s = self.settings.deadline_s if self.control.state == "autonomous" else 0.0
-            self._ask_in_time(self._asker, obs, tick, begun + wait_s)
+            deadline = begun + (self.settings.deadline_s if self.control.state == "autonomous" else 0.0)
+            self._receive(asker.take(), tick)
+            if asker.idle and self._wants(tick, obs):
+                self._note_asked(tick, obs)
+                if self._waiting_since is None:
+                    self._waiting_since = time.monotonic()
+                asker.ask(stamped(copied(obs), self._extras()))
+            while not asker.idle and (left_s := deadline - time.monotonic()) > 0:
+                fresh = self.settings.mode != "async" and self._request.tick == tick
+                if not fresh and self._next() is not None:
+                    break
+                self._receive(asker.take(left_s), tick)
 
     def _choose_safe(self) -> None:
         """Choose the safe action; raises `ConfigError` if it does not fit the policy's actions."""
@@ -374,20 +384,6 @@ class ChunkPlayer(Agent):
             return self.settings.execute is not None and step.row >= self.settings.execute
         last = step.chunk.end == self._plan.executed + 1  # also true for every answer with a single action
         return last or tick - self._request.tick >= (self.settings.execute or 1)
-
-    def _ask_in_time(self, asker: AsyncCaller, obs: Obs, tick: int, deadline: float) -> None:
-        """Take an answer, send a request if one is due, and wait for its answer as long as allowed and needed."""
-        self._receive(asker.take(), tick)
-        if asker.idle and self._wants(tick, obs):
-            self._note_asked(tick, obs)
-            if self._waiting_since is None:
-                self._waiting_since = time.monotonic()
-            asker.ask(stamped(copied(obs), self._extras()))
-        while not asker.idle and (left_s := deadline - time.monotonic()) > 0:
-            fresh = self.settings.mode != "async" and self._request.tick == tick
-            if not fresh and self._next() is not None:
-                break
-            self._receive(asker.take(left_s), tick)
 
     def _receive(self, answer: Act | Exception | None, tick: int) -> None:
         if answer is None:

@@ -28,7 +28,7 @@ from vlagents_ray.registry import require
 from vlagents_ray.serve.python_env.create import has_gpu
 
 if TYPE_CHECKING:
-    from vlagents_ray.envs.render_probe import RenderProbe
+    from vlagents_ray.envs.graphics import RenderProbe
 
 
 GB = 1e9
@@ -315,15 +315,14 @@ def triton_compiler(headers: Path) -> Check:
 
 def vulkan() -> Check:
     """Check that SAPIEN, the engine of ManiSkill, renders a frame here."""
-    from vlagents_ray.envs.render_probe import render_probe
+    from vlagents_ray.envs.graphics import render_probe
 
     return _rendered("ManiSkill", render_probe())
 
 
 def egl() -> Check:
     """Check that MuJoCo renders a frame here without a display, also for a worker without a GPU."""
-    from vlagents_ray.envs.graphics import SHARE, fitting
-    from vlagents_ray.envs.render_probe import egl_probe
+    from vlagents_ray.envs.graphics import SHARE, egl_probe, fitting
 
     probe = egl_probe()
     found = _rendered("MuJoCo", probe)

@@ -8,7 +8,7 @@ import os
 import time
 import uuid
 from collections import deque
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import TYPE_CHECKING, Any
@@ -399,23 +399,21 @@ class RemoteAgent(Agent):
 
     def _call(self, sessions: Sequence[ClientSession], requests: Sequence[Request], timeout_s: float) -> list[Reply]:
         call = partial(call_with_recovery, self._connection, sessions) if self._resume else self._connection.call
-        send = partial(call, requests, timeout_s)
-        return send() if self._tracer is None else self._traced(requests, send)
-
-    def _traced(self, requests: Sequence[Request], send: Callable[[], list[Reply]]) -> list[Reply]:
-        """Send one message within a span, a child of the caller's if there is one and the parent of the server's."""
+        if self._tracer is None:
+            return call(requests, timeout_s)
+        # Within a span, a child of the caller's if there is one and the parent of the server's.
         trace: Any = require("opentelemetry.trace", extra="otel")
         context: Any = require("opentelemetry.trace.propagation.tracecontext", extra="otel")
         about = {"server.url": self.url, "transport": self.transport, "requests": len(requests)}
         name = f"vlagents {requests[0].op}"
-        with self._tracer.start_as_current_span(name, kind=trace.SpanKind.CLIENT, attributes=about) as span:  # type: ignore[union-attr]
+        with self._tracer.start_as_current_span(name, kind=trace.SpanKind.CLIENT, attributes=about) as span:
             carrier: dict[str, str] = {}
             context.TraceContextTextMapPropagator().inject(carrier)
             for request in requests:
                 if request.obs is not None:
                     info = {**request.obs.info, TRACEPARENT: carrier[TRACEPARENT]}
                     request.obs = replace(request.obs, info=info)
-            replies = send()
+            replies = call(requests, timeout_s)
             if failed := [reply.error for reply in replies if reply.error is not None]:
                 span.set_status(trace.StatusCode.ERROR, f"{failed[0].code}: {failed[0]}")
             return replies

@@ -120,19 +120,15 @@ def tls_failure(url: str, error: ssl.SSLError) -> VLAgentsError:
 
 def require_plain(url: SplitResult, timeout_s: float) -> None:
     """Raise `ConfigError` if the URL is not encrypted but its port speaks TLS, whatever the certificate."""
-    if url.scheme in ("http", "ws") and _speaks_tls(url, timeout_s):
-        port = url.netloc.rpartition("@")[2]
-        raise ConfigError(f"http://{port}: this port speaks TLS; write https://{port}")
-
-
-def _speaks_tls(url: SplitResult, timeout_s: float) -> bool:
+    if url.scheme not in ("http", "ws"):
+        return
     context = ssl.create_default_context()
     context.check_hostname, context.verify_mode = False, ssl.CERT_NONE
     try:
         with socket.create_connection((url.hostname, url.port or 80), timeout_s) as connection:
             context.wrap_socket(connection, server_hostname=url.hostname).close()
-    except ssl.SSLError as error:
-        return "ALERT" in (error.reason or "")  # also a sign of TLS
-    except OSError:
-        return False
-    return True
+    except OSError as error:
+        if not isinstance(error, ssl.SSLError) or "ALERT" not in (error.reason or ""):  # an alert is a sign of TLS
+            return
+    port = url.netloc.rpartition("@")[2]
+    raise ConfigError(f"http://{port}: this port speaks TLS; write https://{port}")

@@ -287,8 +287,7 @@ DELTA_POSE = ActionSpec(
 
 def require_cameras(env: str, names: Collection[str], have: Collection[str]) -> None:
     """Raise `ConfigError` unless an env has the cameras of these names."""
-    unknown = sorted(set(names) - set(have))
-    if unknown:
+    if unknown := sorted(set(names) - set(have)):
         raise ConfigError(f"{env} has no camera {unknown}: want some of {sorted(have)}")
 
 
@@ -373,7 +372,7 @@ class SequentialBatch(BatchEnv):
             answer: Any = self._envs[i].step(act)
             if not isinstance(answer, tuple) or len(answer) != 5:
                 want = "(Obs, reward, terminated, truncated, info)"
-                raise EnvFailed(f"env step: got {_kind(answer)}, want {want}; see EvalEnv.step")
+                raise EnvFailed(f"env step: got {kind_of(answer)}, want {want}; see EvalEnv.step")
             seen[i], rewards[i], terminated[i], truncated[i], infos[i] = answer
         self._seen = self._stacked(seen, moving)
         return self._seen, rewards, terminated, truncated, infos
@@ -382,8 +381,7 @@ class SequentialBatch(BatchEnv):
         return self._envs[0].renderer()
 
     def describe(self) -> dict[str, Any]:
-        several = {} if self.num_envs == 1 else {"num_envs": self.num_envs}
-        return {**self._envs[0].describe(), **several}
+        return self._envs[0].describe() | ({} if self.num_envs == 1 else {"num_envs": self.num_envs})
 
     def close(self) -> None:
         with ExitStack() as closing:
@@ -409,7 +407,7 @@ class SequentialBatch(BatchEnv):
 def _begun(env: EvalEnv, seed: int, options: Options | None) -> Obs:
     answer: Any = env.reset(seed=seed, options=options)
     if not isinstance(answer, tuple) or len(answer) != 2:
-        raise EnvFailed(f"env reset: got {_kind(answer)}, want (Obs, info); see EvalEnv.reset")
+        raise EnvFailed(f"env reset: got {kind_of(answer)}, want (Obs, info); see EvalEnv.reset")
     obs: Obs = answer[0]
     return obs
 
@@ -423,5 +421,6 @@ def episodes_of(seeds: Sequence[int], num_envs: int) -> int:
     return len(seeds)
 
 
-def _kind(answer: object) -> str:
+def kind_of(answer: object) -> str:
+    """Return what an environment answered, for an error message."""
     return f"a tuple of {len(answer)}" if isinstance(answer, tuple) else type(answer).__name__

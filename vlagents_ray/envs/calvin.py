@@ -1,9 +1,4 @@
-"""CALVIN: chains of five tasks, given in words, at a table with drawer, sliding door, lights and blocks.
-
-with Calvin("D") as env:
-    obs, _ = env.reset(seed=0)
-    obs, reward, terminated, truncated, info = env.step(Act(action=np.array([0, 0, 0, 0, 0, 0, 1], np.float32)))
-"""
+"""CALVIN: chains of five tasks, given in words, at a table with drawer, sliding door, lights and blocks."""
 
 from __future__ import annotations
 
@@ -31,9 +26,8 @@ import numpy as np
 
 from vlagents_ray.contract import ActionSpec, CameraSpec, Contract, StateSpec
 from vlagents_ray.envs import graphics
-from vlagents_ray.envs.graphics import EGL_DEVICE, Renderer
-from vlagents_ray.envs.render_probe import EGL_CURE, without
-from vlagents_ray.envs.simulator import BenchmarkProtocol, SimulatorEnv
+from vlagents_ray.envs.graphics import EGL_CURE, EGL_DEVICE, Renderer
+from vlagents_ray.envs.simulator import BenchmarkProtocol, SimulatorEnv, without
 from vlagents_ray.errors import ConfigError, EnvFailed, NotReset
 from vlagents_ray.interface import Obs
 from vlagents_ray.ray_tools.git_state import code_in
@@ -74,7 +68,7 @@ class Chains:
         self._state_of = utils["get_env_state_for_initial_condition"]
         self._rules = rules = _definitions(
             evaluation / "multistep_sequences.py",
-            ProcessPoolExecutor=_Places,
+            ProcessPoolExecutor=lambda max_workers: contextlib.nullcontext(SimpleNamespace(map=_places)),  # noqa: ARG005
             deepcopy=copy.deepcopy,
             functools=functools,
             logging=logging,
@@ -97,20 +91,9 @@ class Chains:
         return Chain(found[place], *self._state_of(state))
 
 
-class _Places:
-    """Replaces the pool of processes: returns the seed and place of each chain of a state instead of the chains."""
-
-    def __init__(self, max_workers: int) -> None:
-        pass
-
-    def __enter__(self) -> _Places:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        pass
-
-    def map(self, _: Callable[..., Any], jobs: Iterable[tuple[Any, int, int]]) -> list[list[np.ndarray]]:
-        return [[np.array([seed, place]) for place in range(count)] for _, count, seed in jobs]
+def _places(_: Callable[..., Any], jobs: Iterable[tuple[Any, int, int]]) -> list[list[np.ndarray]]:
+    """Return the seed and place of each chain of a state, instead of the chains that CALVIN's processes would draw."""
+    return [[np.array([seed, place]) for place in range(count)] for _, count, seed in jobs]
 
 
 def fnv1_32(text: str) -> int:
@@ -329,8 +312,7 @@ def find_checkout(chosen: str | None) -> Path:
     if not named:
         raise ConfigError(f"calvin: {VARIABLE} is not set; {_CURE}")
     checkout = Path(named).expanduser().resolve()
-    lacks = [str(part) for part in (_CONF, _TASKS, _WORDS) if not (checkout / part).exists()]
-    if lacks:
+    if lacks := [str(part) for part in (_CONF, _TASKS, _WORDS) if not (checkout / part).exists()]:
         raise ConfigError(f"calvin: {checkout} lacks {lacks}, want a checkout of CALVIN with its submodules; {_CURE}")
     return checkout
 

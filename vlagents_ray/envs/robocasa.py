@@ -1,9 +1,4 @@
-"""RoboCasa365's kitchen tasks: a Panda arm on a mobile base, in MuJoCo; the fifty of its evaluation.
-
-with RoboCasa("NavigateKitchen") as env:
-    obs, _ = env.reset(seed=0)
-    obs, reward, terminated, truncated, info = env.step(Act(action=np.zeros(12, np.float32)))
-"""
+"""RoboCasa365's kitchen tasks: a Panda arm on a mobile base, in MuJoCo; the fifty of its evaluation."""
 
 from __future__ import annotations
 
@@ -20,9 +15,8 @@ import numpy as np
 
 from vlagents_ray.contract import CameraSpec, Contract, StateSpec
 from vlagents_ray.envs.base import DELTA_POSE
-from vlagents_ray.envs.render_probe import failing
 from vlagents_ray.envs.robosuite import RobosuiteEnv, importing_robosuite, seeded
-from vlagents_ray.envs.simulator import BenchmarkProtocol
+from vlagents_ray.envs.simulator import BenchmarkProtocol, failing
 from vlagents_ray.errors import ConfigError, EnvFailed
 from vlagents_ray.interface import Obs
 from vlagents_ray.registry import require
@@ -192,7 +186,15 @@ class RoboCasa(RobosuiteEnv):
         self._order = _FROM_BASE_FIRST if action_order == "base_first" else list(range(12))
         self._registries = tuple(object_registries)
         images = self._contract.cameras or {}
-        simulator = self._load()
+        require_assets(self._registries)
+        with (
+            failing(self._name, "import robocasa"),
+            importing_robosuite("robocasa"),
+            contextlib.redirect_stdout(io.StringIO()),  # advice about packages that are not needed
+            warnings.catch_warnings(),
+        ):
+            warnings.simplefilter("ignore")  # warnings of upstream code
+            simulator: Any = require("robocasa")
         with self._making(), seeded(0):
             made = simulator.utils.env_utils.create_env(
                 task,
@@ -206,17 +208,6 @@ class RoboCasa(RobosuiteEnv):
             made.use_camera_obs = made.has_offscreen_renderer = bool(images)  # before the first reset loads the model
             self._use(made)
         self._versions = {"robocasa": simulator.__version__, "robosuite": simulator.robosuite.__version__}
-
-    def _load(self) -> Any:
-        require_assets(self._registries)
-        with (
-            failing(self._name, "import robocasa"),
-            importing_robosuite("robocasa"),
-            contextlib.redirect_stdout(io.StringIO()),  # advice about packages that are not needed
-            warnings.catch_warnings(),
-        ):
-            warnings.simplefilter("ignore")  # warnings of upstream code
-            return require("robocasa")
 
     @classmethod
     def known_contract(cls, arguments: Mapping[str, Any]) -> Contract:

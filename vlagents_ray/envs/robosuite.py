@@ -1,9 +1,4 @@
-"""robosuite's tasks of the robomimic study: Panda arms at a table in MuJoCo.
-
-with Robosuite("Lift") as env:
-    obs, _ = env.reset(seed=0)
-    obs, reward, terminated, truncated, info = env.step(Act(action=np.zeros(7, np.float32)))
-"""
+"""robosuite's tasks of the robomimic study: Panda arms at a table in MuJoCo."""
 
 from __future__ import annotations
 
@@ -11,7 +6,7 @@ import functools
 import logging
 import os
 import warnings
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from typing import Any
@@ -20,11 +15,11 @@ import numpy as np
 
 from vlagents_ray.contract import CameraSpec, Contract, StateSpec
 from vlagents_ray.envs.base import DELTA_POSE
-from vlagents_ray.envs.graphics import EGL_DEVICE, GPUS
-from vlagents_ray.envs.render_probe import EGL_CURE
-from vlagents_ray.envs.simulator import BenchmarkProtocol, SimulatorEnv, Size
+from vlagents_ray.envs.graphics import EGL_CURE, EGL_DEVICE, GPUS
+from vlagents_ray.envs.simulator import BenchmarkProtocol, SimulatorEnv
 from vlagents_ray.errors import ConfigError, EnvFailed
 from vlagents_ray.interface import Obs
+from vlagents_ray.ray_tools.session import variables
 from vlagents_ray.registry import require
 
 _OPEN_M = 0.04  # m, travel of a finger from closed to open
@@ -109,17 +104,15 @@ class CameraRenderer:
 
     def _sensors(self, cam_name: str, cam_w: int, cam_h: int, **rest: Any) -> tuple[list[Any], list[str]]:
         [own], names = self._own(cam_name, cam_w=cam_w, cam_h=cam_h, **rest)
-        return [self._switched(own, (cam_h, cam_w))], names
 
-    def _switched(self, own: Callable[[Any], np.ndarray], size: Size) -> Callable[[Any], Any]:
         @functools.wraps(own)  # keeps robosuite's attributes
-        def look(cache: Any) -> np.ndarray:
+        def look(cache: Any) -> Any:
             if not self.open:
-                return np.zeros((*size, 3), np.uint8)
+                return np.zeros((cam_h, cam_w, 3), np.uint8)
             self.make_current()
             return own(cache)
 
-        return look
+        return [look], names
 
 
 @contextmanager
@@ -135,48 +128,26 @@ def seeded(seed: int) -> Iterator[None]:
 
 @contextmanager
 def importing_robosuite(env: str) -> Iterator[None]:
-    """Guard the first import of robosuite; `env` is named in errors."""
-    with _no_log_file(), _egl_number(env):
-        yield
-
-
-@contextmanager
-def _no_log_file() -> Iterator[None]:
-    """Suppress robosuite's advice and its log file, whose path is the same for all users of the machine."""
-
-    def nowhere(_filename: object) -> logging.Handler:
-        return logging.NullHandler()
-
-    log = logging.getLogger("robosuite_logs")
-    real, level = logging.FileHandler, log.level
-    logging.FileHandler = nowhere  # type: ignore[assignment,misc]
-    log.setLevel(logging.ERROR)
-    try:
-        yield
-    finally:
-        logging.FileHandler = real  # type: ignore[misc]
-        log.setLevel(level)
-
-
-@contextmanager
-def _egl_number(env: str) -> Iterator[None]:
-    """Make robosuite render on the chosen EGL device.
+    """Guard the first import of robosuite: make it render on the chosen EGL device, and suppress its advice and log.
 
     When it is imported, robosuite reads EGL's device number as CUDA's, and refuses numbers that CUDA_VISIBLE_DEVICES
     does not list. If no EGL device was chosen, it would render on the one with CUDA's number, and fail on an empty
-    CUDA_VISIBLE_DEVICES; the worker finds out which device was used.
+    CUDA_VISIBLE_DEVICES; the worker finds out which device was used. The log file's path is the same for all users of
+    the machine. Errors name `env`.
     """
     chosen, visible = os.environ.get(EGL_DEVICE), os.environ.get(GPUS)
     if visible == "" and chosen is None and os.environ.get("MUJOCO_GL") == "egl":
         raise EnvFailed(f"{env} finds no EGL device that renders in software, and was given no GPU; {EGL_CURE}")
-    if chosen is None or not visible:
-        yield
-        return
-    os.environ[GPUS] = chosen
+    log = logging.getLogger("robosuite_logs")
+    real, level = logging.FileHandler, log.level
+    logging.FileHandler = lambda _: logging.NullHandler()  # type: ignore[assignment,misc]
+    log.setLevel(logging.ERROR)
     try:
-        yield
+        with variables({} if chosen is None or not visible else {GPUS: chosen}):
+            yield
     finally:
-        os.environ[GPUS] = visible
+        logging.FileHandler = real  # type: ignore[misc]
+        log.setLevel(level)
 
 
 CONTROL_HZ = 20.0

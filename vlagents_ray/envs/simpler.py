@@ -98,14 +98,26 @@ class Simpler(SimulatorEnv):
             shader: ManiSkill's name of the shader; the protocol uses "default".
         """
         super().__init__(task)
-        _find_assets(assets)
+        if assets is not None and "mani_skill" not in sys.modules:
+            os.environ["MS_ASSET_DIR"] = assets
+        used = require("mani_skill").ASSET_DIR.parent
+        if assets is not None and used.resolve() != Path(assets).resolve():
+            raise ConfigError(
+                f"simpler: assets is {assets!r}, but this process has read ManiSkill's from {str(used)!r}; "
+                f"set MS_ASSET_DIR before it starts"
+            )
+        if missing := _missing_assets(used):
+            raise EnvFailed(missing)
         self.max_steps, own_limit = step_limits(self._name, task, max_steps)
         self._deviations = [] if self.max_steps == own_limit else [f"max_steps is {max_steps}, not {own_limit}"]
         if shader != PROTOCOL.shader:
             self._deviations.append(f"shader is {shader}, not {PROTOCOL.shader}")
         self._task = task
         self._given_instruction = instruction
-        twins = _own_lists()
+        # ManiSkill keeps the photographs, and the objects that they must not hide, in lists of the class. A second twin
+        # of this process would otherwise use the lists of the first one.
+        twins: Any = require("mani_skill.envs.tasks.digital_twins.base_env").BaseDigitalTwinEnv
+        twins._objects_to_remove_from_greenscreen, twins._rgb_overlay_images = [], {}
         self._env = Simulator(
             self._name,
             task,
@@ -180,33 +192,8 @@ def _command(action: np.ndarray) -> np.ndarray:
     return np.concatenate([action[:3], np.asarray(axis) * angle, [gripper]]).astype(np.float32)
 
 
-def _own_lists() -> Any:
-    """Return the base class of the digital twins, with lists that are not shared with other twins of this process.
-
-    ManiSkill keeps the photographs, and the objects that they must not hide, in lists of the class. A second twin would
-    otherwise use the lists of the first one.
-    """
-    twins = require("mani_skill.envs.tasks.digital_twins.base_env").BaseDigitalTwinEnv
-    twins._objects_to_remove_from_greenscreen, twins._rgb_overlay_images = [], {}
-    return twins
-
-
 def _missing_assets(folder: Path) -> str | None:
     lacks = [place for place in _DATA.values() if not (folder / "data" / place).is_dir()]
     if not lacks:
         return None
     return f"SIMPLER's assets are not in {folder} (no data/{lacks[0]}); set MS_ASSET_DIR, or get them: {_DOWNLOADS}"
-
-
-def _find_assets(wanted: str | None) -> None:
-    if wanted is not None and "mani_skill" not in sys.modules:
-        os.environ["MS_ASSET_DIR"] = wanted
-    used = require("mani_skill").ASSET_DIR.parent
-    if wanted is not None and used.resolve() != Path(wanted).resolve():
-        raise ConfigError(
-            f"simpler: assets is {wanted!r}, but this process has read ManiSkill's from {str(used)!r}; "
-            f"set MS_ASSET_DIR before it starts"
-        )
-    missing = _missing_assets(used)
-    if missing:
-        raise EnvFailed(missing)

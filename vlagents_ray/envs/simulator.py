@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib.util
 import os
 from abc import abstractmethod
 from collections.abc import Collection, Iterator, Sequence
@@ -14,9 +15,8 @@ import numpy as np
 
 from vlagents_ray.contract import Contract
 from vlagents_ray.envs.base import EvalEnv, Options, one_row, require_cameras, require_known
-from vlagents_ray.envs.graphics import prepare_rendering
-from vlagents_ray.envs.render_probe import egl_probe, failing, without
-from vlagents_ray.errors import ConfigError, EnvFailed, NotReset
+from vlagents_ray.envs.graphics import EGL_CURE, egl_probe, prepare_rendering, vulkan_cure
+from vlagents_ray.errors import ConfigError, EnvFailed, NotReset, VLAgentsError
 from vlagents_ray.interface import Act, Obs
 from vlagents_ray.registry import require
 
@@ -49,6 +49,10 @@ class BenchmarkProtocol:
 
 class SimulatorEnv(EvalEnv):
     """One environment of a simulator in this process.
+
+        with RoboCasa("NavigateKitchen") as env:
+            obs, _ = env.reset(seed=0)
+            obs, reward, terminated, truncated, info = env.step(Act(action=np.zeros(12, np.float32)))
 
     A subclass sets the class variables below, makes its simulator in the constructor within `_making`, and registers
     its clean-up with `_resources`. `_begin` begins an episode and `_advance` executes a step; both are only called
@@ -112,11 +116,17 @@ class SimulatorEnv(EvalEnv):
         seed selects. There are no other options.
         """
         self._alive()
-        state = self._initial_state(seed, options or {})
+        given, count = options or {}, self.init_states
+        if unknown := sorted(set(given) - ({"init_state"} if count is not None else set())):
+            want = "none" if count is None else "init_state or none"
+            raise ConfigError(f"{self._name}: unknown reset options {unknown}, want {want}")
+        state = given.get("init_state", seed % (count or 1))
+        if type(state) is not int or not 0 <= state < (count or 1):
+            raise ConfigError(f"{self._name}: init_state is {state!r}, want 0 to {(count or 1) - 1}")
         with failing(self._name, "reset"):
             obs, info = self._begin(seed % 2**32, state)
         self._steps = 0
-        return obs, {"success": False} | ({} if self.init_states is None else {"init_state": state}) | info
+        return obs, {"success": False} | ({} if count is None else {"init_state": state}) | info
 
     def step(self, act: Act) -> tuple[Obs, float, bool, bool, dict[str, Any]]:
         self._alive()
@@ -162,17 +172,6 @@ class SimulatorEnv(EvalEnv):
     def _solved(self, success: bool) -> tuple[bool, dict[str, Any]]:
         """Return `terminated` and `info` for a step, given whether the task is solved after it."""
         return success and self._ends_on_success, {"success": success}
-
-    def _initial_state(self, seed: int, options: Options) -> int:
-        count = self.init_states
-        unknown = sorted(set(options) - ({"init_state"} if count is not None else set()))
-        if unknown:
-            want = "none" if count is None else "init_state or none"
-            raise ConfigError(f"{self._name}: unknown reset options {unknown}, want {want}")
-        state = options.get("init_state", seed % (count or 1))
-        if type(state) is not int or not 0 <= state < (count or 1):
-            raise ConfigError(f"{self._name}: init_state is {state!r}, want 0 to {(count or 1) - 1}")
-        return state
 
     def _alive(self) -> Any:
         if self._env is None:
@@ -241,3 +240,25 @@ def require_sizes(env: str, **sizes: int | None) -> None:
 
 def camera_names(model: Any) -> list[str]:
     return [model.camera(i).name for i in range(model.ncam)]
+
+
+def without(modules: Sequence[str], cure: str) -> str | None:
+    """Return which of these modules are not installed, with the cure; None if all are."""
+    missing = next((module for module in modules if importlib.util.find_spec(module) is None), None)
+    return None if missing is None else f"{missing} is not installed; {cure}"
+
+
+@contextmanager
+def failing(env: str, doing: str) -> Iterator[None]:
+    """Turn errors of a simulator into `EnvFailed`, with the cure of its driver; this package's own pass unchanged."""
+    try:
+        yield
+    except VLAgentsError:
+        raise
+    except Exception as error:
+        cure = ""
+        if any(word in str(error) for word in ("EGL", "OpenGL", "GLContext", "mjr_makeContext")):
+            cure = f"; {EGL_CURE}"
+        elif any(word in str(error) for word in ("vk::", "rendering device", "Vulkan")):
+            cure = f"; {vulkan_cure()}"
+        raise EnvFailed(f"{env} failed to {doing}: {type(error).__name__}: {error}{cure}") from error

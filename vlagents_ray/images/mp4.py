@@ -1,9 +1,10 @@
-"""An encoder of H.264 videos in MP4, which browsers play."""
+"""Videos: an encoder of H.264 in MP4, which browsers play, and the images of decoded frames."""
 
 from __future__ import annotations
 
 import contextlib
 import io
+from collections.abc import Callable
 from fractions import Fraction
 from pathlib import Path
 from typing import Any
@@ -12,6 +13,15 @@ import numpy as np
 
 from vlagents_ray.errors import InvalidObservation
 from vlagents_ray.registry import require
+
+
+def rgb_converter() -> Callable[[Any], np.ndarray]:
+    """Return what converts the decoded frames of one video to images, (H, W, 3) uint8 RGB.
+
+    It keeps its tables and threads, which the `to_ndarray` of a frame makes for that frame alone, in at least 0.25 ms.
+    """
+    reformat = require("av").video.reformatter.VideoReformatter().reformat
+    return lambda frame: reformat(frame, format="rgb24").to_ndarray()
 
 
 class Mp4:

@@ -8,7 +8,7 @@ import uuid
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 from functools import partial
 from itertools import islice
 from pathlib import Path
@@ -135,17 +135,13 @@ class ErrorTable:
         self.frames[:rows] += 1
         return float(error.mean())
 
-    def mean(self) -> np.ndarray:
-        return np.asarray(self.absolute / self.frames[:, np.newaxis])
-
     def to_json(self, joints: list[str]) -> dict[str, Any]:
         """Return the errors overall, by joint, by step, and by both, in the units of the actions."""
         total = max(1, int(self.frames.sum()))
         mae, rms = self.absolute.sum(0) / total, np.sqrt(self.square.sum(0) / total)
         largest = self.largest.max(0, initial=0)
-        by_step = zip(
-            self.frames, self.mean().mean(1), np.sqrt((self.square / self.frames[:, None]).mean(1)), strict=True
-        )
+        means, squares = (sums / self.frames[:, np.newaxis] for sums in (self.absolute, self.square))
+        by_step = zip(self.frames, means.mean(1), np.sqrt(squares.mean(1)), strict=True)
         return {
             "mae": float(mae.mean()),
             "rmse": float(np.sqrt((rms**2).mean())),
@@ -158,18 +154,8 @@ class ErrorTable:
                 {"step": step, "frames": int(frames), "mae": float(mean), "rmse": float(root)}
                 for step, (frames, mean, root) in enumerate(by_step)
             ],
-            "mae_by_step_and_joint": self.mean().tolist(),
+            "mae_by_step_and_joint": means.tolist(),
         }
-
-
-@dataclass(frozen=True, slots=True)
-class FrameError:
-    """The mean absolute error of one frame's chunk."""
-
-    dataset: str
-    episode: int
-    frame: int
-    mae: float
 
 
 @dataclass(frozen=True, slots=True)
@@ -193,12 +179,12 @@ class OpenLoopResult:
     table: ErrorTable
     sessions: int = 0
     missing: int = 0  # acts that the recording lacks, so that a policy with a history received less
-    frames: list[FrameError] = field(default_factory=list)
+    frames: list[dict[str, Any]] = field(default_factory=list)  # dataset, episode, frame, and its chunk's "mae"
 
     def to_json(self) -> dict[str, Any]:
         by_episode: dict[tuple[str, int], list[float]] = {}
         for one in self.frames:
-            by_episode.setdefault((one.dataset, one.episode), []).append(one.mae)
+            by_episode.setdefault((one["dataset"], one["episode"]), []).append(one["mae"])
         return {
             "datasets": self.datasets,
             "against": self.against,
@@ -210,7 +196,7 @@ class OpenLoopResult:
                 {"dataset": dataset, "episode": episode, "frames": len(errors), "mae": float(np.mean(errors))}
                 for (dataset, episode), errors in sorted(by_episode.items())
             ],
-            "worst": [asdict(one) for one in sorted(self.frames, key=lambda one: -one.mae)[:_WORST]],
+            "worst": sorted(self.frames, key=lambda one: -one["mae"])[:_WORST],
         }
 
 
@@ -254,7 +240,8 @@ def replay(folder: Path, sessions: Sessions, plan: ReplayPlan) -> OpenLoopResult
                 rows = min(len(expected), len(got), plan.horizon or len(got))
                 with lock:
                     mae = result.table.add(expected[:rows], got[:rows])
-                    result.frames.append(FrameError(part.dataset.root.name, part.index, step.frame, mae))
+                    place = {"dataset": part.dataset.root.name, "episode": part.index, "frame": step.frame}
+                    result.frames.append({**place, "mae": mae})
         finally:
             agent.close()
         with lock:

@@ -53,36 +53,31 @@ class HeadMonitor:
             ClusterLost: The head has not answered for too long, or the daemon on this machine has ended.
         """
         if monotonic() - self._looked > PERIOD_S:
-            self._look()
+            if self._daemon is not None and not _exists(self._daemon):
+                raise ClusterLost(f"Ray's daemon on this machine, the raylet, has ended; {self._cure}")
+            try:
+                socket.create_connection(self._address, ANSWER_S).close()
+            except OSError as error:
+                if self._looked == self._answered and self._timeout_s > PERIOD_S:
+                    log.warning(
+                        "%s does not answer (%s): no worker is started until it does; this ends after %.0f s",
+                        self._name, error, self._timeout_s,
+                    )  # fmt: skip
+                self._looked = monotonic()
+            else:
+                self._looked = self._answered = monotonic()
         silent_s = self._looked - self._answered
         if silent_s > self._timeout_s:
             raise ClusterLost(f"{self._name} has not answered for {silent_s:.0f} s; {self._cure}")
         return silent_s == 0.0
-
-    def _look(self) -> None:
-        if self._daemon is not None and not _exists(self._daemon):
-            raise ClusterLost(f"Ray's daemon on this machine, the raylet, has ended; {self._cure}")
-        try:
-            socket.create_connection(self._address, ANSWER_S).close()
-        except OSError as error:
-            if self._looked == self._answered and self._timeout_s > PERIOD_S:
-                log.warning(
-                    "%s does not answer (%s): no worker is started until it does; this ends after %.0f s",
-                    self._name, error, self._timeout_s,
-                )  # fmt: skip
-            self._looked = monotonic()
-        else:
-            self._looked = self._answered = monotonic()
 
 
 def head_is_gone() -> bool:
     """Return whether the head refuses connections, as it does from SIGTERM until its process ends seconds later."""
     try:
         socket.create_connection(_address(), ANSWER_S).close()
-    except ConnectionRefusedError:
-        return True
-    except OSError:  # no refusal: the head may be busy
-        return False
+    except OSError as error:
+        return isinstance(error, ConnectionRefusedError)  # otherwise the head may be busy
     return False
 
 

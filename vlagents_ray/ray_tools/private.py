@@ -30,9 +30,7 @@ def node_of_this_process() -> Any:
     second cluster.
     """
     worker: Any = sys.modules.get("ray._private.worker")
-    if worker is None or not worker.global_worker.connected:
-        return None
-    return worker.global_worker.node
+    return None if worker is None or not worker.global_worker.connected else worker.global_worker.node
 
 
 def use_loopback(on: bool) -> bool:
@@ -271,8 +269,7 @@ def http_options() -> Any:
 def replica_is_ending() -> bool:
     """Return whether Serve has begun to stop the replica in this process; Serve has no public hook for that."""
     worker = _worker()
-    actor = worker.actors.get(worker.actor_id)
-    return bool(actor._replica_impl._shutting_down)
+    return bool(worker.actors.get(worker.actor_id)._replica_impl._shutting_down)
 
 
 def replica_request(request_id: str, method: str) -> bytes:

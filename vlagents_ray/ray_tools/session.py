@@ -65,36 +65,28 @@ def joined(address: str | None = None, **options: Any) -> Iterator[None]:
         yield
         return
     options = {"log_to_driver": False, "logging_level": "WARNING"} | options
+    where = address or os.environ.get("RAY_ADDRESS")
+    url = where if where is not None and urlsplit(where).scheme in ("http", "https") else None
     with contextlib.ExitStack() as stack:
         try:
             if address == "local":
                 folder = stack.enter_context(ray_folder())
                 with variables({MARK: str(folder)}):
                     start_ray(folder, **options)
-            elif (server := _local_server(address or os.environ.get("RAY_ADDRESS"))) is not None:
+            # Without a cluster of `ray start`, Ray would try that of a server here, and wait for ten minutes.
+            elif url or (where == "auto" and private.address_of_ray_start() is None and local_servers()):
                 with own_sigterm():
-                    join(server or None, **options)
+                    join(url, **options)
             else:
                 with own_sigterm():
                     ray.init(address=address, **options)
         except (ConnectionError, ray.exceptions.AuthenticationError) as error:
-            where = address or os.environ.get("RAY_ADDRESS")
             raise ConfigError(
                 f"cannot connect to a Ray cluster at {where!r}: {error}. Start Ray on this machine, or join it to a "
                 f"cluster (`ray start`); the page docs/cluster/ray.md shows how"
             ) from error
         stack.push(unless_lost(leave_ray))
         yield
-
-
-def _local_server(address: str | None) -> str | None:
-    """Return the URL of the server on this machine to join; "" for any server; None if the address is Ray's."""
-    if address is not None and urlsplit(address).scheme in ("http", "https"):
-        return address
-    if address != "auto":
-        return None
-    # If there is no cluster of `ray start`, Ray would try that of a server on this machine, and wait for ten minutes.
-    return "" if private.address_of_ray_start() is None and local_servers() else None
 
 
 @contextlib.contextmanager

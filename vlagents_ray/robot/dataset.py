@@ -34,8 +34,12 @@ UNFINISHED = "unfinished"  # folder of the running episodes
 class Dataset:
     """A dataset to which episodes are added; opening an existing one continues it with the same columns."""
 
-    def __init__(self, root: Path, fps: float, *, interventions: bool = False, lossless: bool = False) -> None:
+    def __init__(
+        self, root: Path, fps: float, *, interventions: bool = False, lossless: bool = False, durable: bool = True
+    ) -> None:
         """Open or begin a dataset of frames at `fps` Hz; `lossless` videos keep each pixel.
+
+        With `durable`, an episode is on the disk when `save` returns.
 
         Raises:
             ConfigError: The folder has other files, or a dataset of another rate or version.
@@ -44,6 +48,7 @@ class Dataset:
         self.root = root
         self.interventions = interventions
         self._lossless = lossless
+        self._durable = durable
         self._pq: Any = require("pyarrow.parquet")
         self._pa: Any = require("pyarrow")
         require("av")
@@ -130,7 +135,7 @@ class Dataset:
         about |= {f"stats/{key}/{name}": v.tolist() for key, one in stats.items() for name, v in one.items()}
 
         for key, path in episode.videos.items():
-            _move(path, self.root / VIDEO.format(video_key=key, **place))
+            self._move(path, self.root / VIDEO.format(video_key=key, **place))
         self._parquet(self._table(rows, episode.features), DATA.format(**place))
         self._parquet(self._tasks_table(), "meta/tasks.parquet")
         self._parquet(self._pa.Table.from_pylist([about]), EPISODES.format(**place))
@@ -206,30 +211,35 @@ class Dataset:
     def _parquet(self, table: Any, name: str) -> None:
         part = self._part(name)
         self._pq.write_table(table, part, compression="snappy")
-        _move(part, self.root / name)
+        self._move(part, self.root / name)
 
     def _json(self, value: object, name: str) -> None:
         part = self._part(name)
         part.write_text(json.dumps(value, indent=4, ensure_ascii=False))
-        _move(part, self.root / name)
+        self._move(part, self.root / name)
 
     def _part(self, name: str) -> Path:
         folder = self.root / UNFINISHED
         folder.mkdir(parents=True, exist_ok=True)
         return folder / name.replace("/", "_")
 
+    def _move(self, part: Path, path: Path) -> None:
+        """Rename a complete file, which is on the disk with its new name when this returns, if that is wanted."""
+        path.parent.mkdir(parents=True, exist_ok=True)
+        if self._durable:
+            _sync(part)
+        os.replace(part, path)
+        if self._durable:
+            _sync(path.parent)
+
 
 _ARROW = {"float64": "float64", "float32": "float32", "int64": "int64", "bool": "bool_", "string": "string"}
 
 
-def _move(part: Path, path: Path) -> None:
-    """Rename a complete file durably: the file and its new name are on the disk when this returns."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    with part.open("rb") as file:
-        os.fsync(file.fileno())
-    os.replace(part, path)
-    folder = os.open(path.parent, os.O_RDONLY | os.O_DIRECTORY)
+def _sync(path: Path) -> None:
+    """Write a file, or the names in a folder, to the disk."""
+    file = os.open(path, os.O_RDONLY)
     try:
-        os.fsync(folder)
+        os.fsync(file)
     finally:
-        os.close(folder)
+        os.close(file)

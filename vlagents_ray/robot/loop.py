@@ -186,7 +186,15 @@ def run_loop(
         raise ConfigError(f"restart: got {restart!r}, want one of {list(get_args(Restart))}")
     if seconds is not None and not seconds > 0:
         raise ConfigError(f"seconds: got {seconds}, want above 0, or None")
-    control = _shared_control(agent, watchdog, commands)
+    # The shared state of this robot: the player's, else the watchdog's, else that of the commands.
+    control: Control | None = agent.control
+    if control is None:
+        control = watchdog.control if watchdog is not None else commands.control if commands is not None else Control()
+    if watchdog is not None:
+        watchdog.share(control)
+    if commands is not None and commands.control is not control:
+        control.adopt(commands.control)
+        commands.control = control
     if control.leader is not None and recorder is not None and not recorder.interventions:
         raise ConfigError(
             "recorder: got one without interventions for a player with override=; want Recorder(…, interventions=True)"
@@ -194,7 +202,11 @@ def run_loop(
     report = LoopReport(hz)
     stops = len(control.stops)
     agent.initialize()
-    run = _Run(robot, agent, control, _guard(agent, guard), watchdog, recorder, commands, LoopView(viewer), report)
+    own = agent.check if isinstance(agent.check, Guard) else None
+    if guard is not None and own is not None and own is not guard:
+        raise ConfigError("guard: got one besides the agent's own check=, want one of them; leave one out")
+    guard = guard or own or Guard(agent.contract)
+    run = _Run(robot, agent, control, guard, watchdog, recorder, commands, LoopView(viewer), report)
     with contextlib.ExitStack() as stack:
         control.begin(auto=restart == "auto")
         try:
@@ -249,7 +261,15 @@ class _Run:
                 if ticks is not None and tick >= ticks:
                     pacer.forget(ticks)
                     break
-                obs, act = self._asked()
+                obs = _observed(self.robot)
+                if self.agent.control is not self.control:  # else `act` has changed it
+                    self.control.update()
+                act = self.agent.act(obs)
+                if act.action.ndim != 1:
+                    raise InvalidAction(
+                        f"action: got {act.action.shape}, want one row; wrap the agent in a ChunkPlayer"
+                    )
+                self.report.done = act.done
                 # Before this tick counts as a sign of life: it may be late.
                 stop = self._held(act)
                 if self.control.over:
@@ -264,23 +284,19 @@ class _Run:
                     self.view.add(obs, act, None, tick, pacer.since_tick_s(), stop.reason)
                 elif (action := self._applied(obs, act)) is not None:
                     work_s.append(pacer.since_tick_s())
-                    self._record(obs, act, action, tick)
+                    led = bool(act.info.get(INTERVENTION))
+                    self.report.interventions += led
+                    if self.recorder is not None:
+                        wanted = act.info.get(WANTED)
+                        self.recorder.add(
+                            obs, action, tick=tick, safe=SAFE in act.info, intervention=led, wanted=wanted
+                        )
                     self.view.add(obs, act, action, tick, work_s[-1])
         finally:
             self.report.jitter = jitter(pacer.late_s, pacer.missed, pacer.ticks)
             if work_s:
                 self.report.work_p50_ms = float(np.median(work_s)) * 1e3
                 self.report.work_p99_ms = float(np.quantile(work_s, 0.99)) * 1e3
-
-    def _asked(self) -> tuple[Obs, Act]:
-        obs = _observed(self.robot)
-        if self.agent.control is not self.control:  # else `act` has changed it
-            self.control.update()
-        act = self.agent.act(obs)
-        if act.action.ndim != 1:
-            raise InvalidAction(f"action: got {act.action.shape}, want one row; wrap the agent in a ChunkPlayer")
-        self.report.done = act.done
-        return obs, act
 
     def _held(self, act: Act) -> Held | None:
         """Obey new commands; return why this tick may command nothing, or None."""
@@ -289,9 +305,8 @@ class _Run:
         held, why, safe = self.control.hold(), getattr(self.robot, "holds", None), _safe(act)
         if held is None and why is not None:
             return Held("robot", str(why))
-        if held is None and safe is not None and safe.cause in ("stopped", "paused"):
-            return safe  # its cause ended after the player's decision
-        return held
+        # The cause of a safe action may have ended after the player's decision.
+        return safe if held is None and safe is not None and safe.cause in ("stopped", "paused") else held
 
     def _stop(self, why: Held) -> None:
         """Command nothing at this tick."""
@@ -314,38 +329,10 @@ class _Run:
         self.robot.apply(action)
         return action
 
-    def _record(self, obs: Obs, act: Act, action: np.ndarray, tick: int) -> None:
-        led = bool(act.info.get(INTERVENTION))
-        self.report.interventions += led
-        if self.recorder is not None:
-            wanted = act.info.get(WANTED)
-            self.recorder.add(obs, action, tick=tick, safe=SAFE in act.info, intervention=led, wanted=wanted)
-
-
-def _shared_control(agent: Agent, watchdog: Watchdog | None, commands: CommandInbox | None) -> Control:
-    """Return the shared state of this robot: the player's, else the watchdog's, else that of the commands."""
-    control: Control | None = agent.control
-    if control is None:
-        control = watchdog.control if watchdog is not None else commands.control if commands is not None else Control()
-    if watchdog is not None:
-        watchdog.share(control)
-    if commands is not None and commands.control is not control:
-        control.adopt(commands.control)
-        commands.control = control
-    return control
-
 
 def _safe(act: Act) -> Held | None:
     """Return why the action of an agent is the safe one; None if it is the policy's or an operator's."""
     return Held(act.info.get(CAUSE, "other"), str(act.info[SAFE])) if SAFE in act.info else None
-
-
-def _guard(agent: Agent, given: Guard | None) -> Guard:
-    """Return the guard of the actions; the agent is initialized, so it has its contract."""
-    own = agent.check if isinstance(agent.check, Guard) else None
-    if given is not None and own is not None and own is not given:
-        raise ConfigError("guard: got one besides the agent's own check=, want one of them; leave one out")
-    return given or own or Guard(agent.contract)
 
 
 def _observed(robot: Robot) -> Obs:

@@ -32,10 +32,15 @@ class SimulatedRobot:
         contract = contract or Contract()
         self._action: ActionSpec = contract.action
         self._parts = {name: spec.dim for name, spec in (contract.state or {"joints": StateSpec()}).items()}
-        self._pictures = {
-            name: _picture(camera.height or _SIDE, camera.width or _SIDE)
-            for name, camera in (contract.cameras or {"front": CameraSpec(), "wrist": CameraSpec()}).items()
-        }
+        self._pictures: dict[
+            str, np.ndarray
+        ] = {}  # gradients with a little noise, which codecs compress like a camera's
+        for name, camera in (contract.cameras or {"front": CameraSpec(), "wrist": CameraSpec()}).items():
+            height, width = camera.height or _SIDE, camera.width or _SIDE
+            y, x = np.mgrid[:height, :width]
+            noise = np.random.default_rng(0).integers(0, 8, (height, width))
+            channels = [x * 200 // width + noise, y * 200 // height + noise, (x + y) % 160 + noise]
+            self._pictures[name] = np.stack(channels, -1).astype(np.uint8)
         self._joints = np.zeros(self._action.dim or 7, np.float32)
         self._target = self._joints.copy()
         self.applied = 0  # actions
@@ -48,7 +53,22 @@ class SimulatedRobot:
             name: np.resize(self._joints, dim if dim is not None else len(self._joints)).astype(np.float32)
             for name, dim in self._parts.items()
         }
-        return Obs({name: self._seen(still) for name, still in self._pictures.items()}, self._opening(), state)
+        spec, opening = self._action, 1.0
+        if (
+            spec.gripper_open is not None
+            and spec.gripper_closed is not None
+            and spec.gripper_open != spec.gripper_closed
+        ):
+            share = (float(self._joints[-1]) - spec.gripper_closed) / (spec.gripper_open - spec.gripper_closed)
+            opening = min(1.0, max(0.0, share))
+        images = {name: still.copy() for name, still in self._pictures.items()}
+        turn = float(self._joints[0])
+        for image in images.values():
+            height, width = image.shape[:2]
+            x = round((0.5 + 0.4 * np.sin(turn)) * (width - _DOT))
+            y = round((0.5 + 0.4 * np.cos(turn)) * (height - _DOT))
+            image[max(0, y) : y + _DOT, max(0, x) : x + _DOT] = (220, 40, 40)
+        return Obs(images, opening, state)
 
     def apply(self, action: np.ndarray) -> None:
         """Set the targets of the joints, rad."""
@@ -63,29 +83,6 @@ class SimulatedRobot:
         """Make the current position of the joints their target."""
         self._target = self._joints.copy()
         self.stopped = True
-
-    def _opening(self) -> float:
-        spec = self._action
-        if spec.gripper_open is None or spec.gripper_closed is None or spec.gripper_open == spec.gripper_closed:
-            return 1.0
-        share = (float(self._joints[-1]) - spec.gripper_closed) / (spec.gripper_open - spec.gripper_closed)
-        return min(1.0, max(0.0, share))
-
-    def _seen(self, still: np.ndarray) -> np.ndarray:
-        image = still.copy()
-        height, width = image.shape[:2]
-        turn = float(self._joints[0])
-        x = round((0.5 + 0.4 * np.sin(turn)) * (width - _DOT))
-        y = round((0.5 + 0.4 * np.cos(turn)) * (height - _DOT))
-        image[max(0, y) : y + _DOT, max(0, x) : x + _DOT] = (220, 40, 40)
-        return image
-
-
-def _picture(height: int, width: int) -> np.ndarray:
-    """Make an image of gradients with a little noise, (H, W, 3) uint8, which codecs compress like a camera's."""
-    y, x = np.mgrid[:height, :width]
-    noise = np.random.default_rng(0).integers(0, 8, (height, width))
-    return np.stack([x * 200 // width + noise, y * 200 // height + noise, (x + y) % 160 + noise], -1).astype(np.uint8)
 
 
 class EnvRobot:

@@ -128,8 +128,7 @@ class AxesLeader:
             self._closed = obs.gripper is not None and obs.gripper < _FULLY_OPEN
         if self._device.gripper_presses() % 2:
             self._closed = not self._closed
-        command = self._spec.gripper_closed if self._closed else self._spec.gripper_open
-        return float(command or 0.0)
+        return float((self._spec.gripper_closed if self._closed else self._spec.gripper_open) or 0.0)
 
 
 # A keyboard as a device with axes, read from the terminal so that it also works over SSH.
@@ -324,10 +323,10 @@ class Terminal:
             termios.tcsetattr(self.descriptor, termios.TCSADRAIN, before)
 
     @contextlib.contextmanager
-    def consumed_by(self, consumer: Consumer) -> Iterator[None]:
-        """Pass the keys to a consumer within the context, unless another one begins in it."""
+    def consumed_by(self, consumer: Consumer, *, last: bool = False) -> Iterator[None]:
+        """Pass the keys to a consumer within the context, as the newest or, with `last`, after all others."""
         with self._lock:
-            self._own.append(consumer)
+            self._own.insert(0 if last else len(self._own), consumer)
         try:
             yield
         finally:
@@ -362,16 +361,13 @@ class Terminal:
                 pass
 
         thread = threading.Thread(target=read, name="vlagents-ray-terminal", daemon=True)
-        with self._lock:
-            self._own.insert(0, consumer)
-        thread.start()
-        try:
-            yield
-        finally:
-            over.set()
-            thread.join()
-            with self._lock:
-                self._own.remove(consumer)
+        with self.consumed_by(consumer, last=True):
+            thread.start()
+            try:
+                yield
+            finally:
+                over.set()
+                thread.join()
 
     def _is_in_foreground(self) -> bool:
         """Return whether this process may read: in the background, reading from the terminal would suspend it."""

@@ -37,9 +37,9 @@ from vlagents_ray.policies.base.accelerator import empty_cache, free_memory, is_
 from vlagents_ray.policies.compilation import CAPTURES
 from vlagents_ray.policies.wrapper import Wrapper
 from vlagents_ray.weights import trainable
-from vlagents_ray.weights.pinned_copies import beside_acts
 from vlagents_ray.weights.safetensors import ValueSpec, read_header
 from vlagents_ray.weights.shared_values import SharedValues, gpu_of, opened, readable_gpus
+from vlagents_ray.weights.trainable import beside_acts
 
 logger = logging.getLogger(__name__)
 

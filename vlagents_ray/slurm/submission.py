@@ -59,39 +59,32 @@ def split(words: Sequence[str], known: Mapping[str, bool]) -> tuple[list[str], d
             if known[name] and not equals:
                 own.append(_next(waiting, name))
         else:
-            option, attached = _sbatch(word, name, value if equals else None)
+            option, attached = name[2:], value if equals else None
+            if is_short := not word.startswith("--"):
+                option, attached = _SHORT.get(word[1], word[1]), word[2:] or None
+            if option in _OURS:
+                raise ConfigError(
+                    f"{word}: got an option that does not fit one Ray process on each node; want {_OURS[option]}"
+                )
+            if is_short and len(option) == 1:
+                raise ConfigError(f"{word}: got an option that is neither this command's nor a short one of sbatch")
+            if not re.fullmatch(r"[a-z][a-z0-9-]*", option):
+                raise ConfigError(f"{word}: got an invalid option name, want --NAME=VALUE")
             if option not in _ALONE and attached is None:
                 attached = _next(waiting, f"--{option}")
             sbatch[option] = attached
     return own, sbatch
 
 
-def _sbatch(word: str, name: str, value: str | None) -> tuple[str, str | None]:
-    """Return the long name of an option of sbatch, and its value if the same argument contains it."""
-    option = name[2:]
-    if not word.startswith("--"):
-        letter = word[1]
-        option, value = _SHORT.get(letter, letter), word[2:] or None
-    if option in _OURS:
-        raise ConfigError(f"{word}: got an option that does not fit one Ray process on each node; want {_OURS[option]}")
-    if not word.startswith("--") and len(option) == 1:
-        raise ConfigError(f"{word}: got an option that is neither this command's nor a short one of sbatch")
-    if not re.fullmatch(r"[a-z][a-z0-9-]*", option):
-        raise ConfigError(f"{word}: got an invalid option name, want --NAME=VALUE")
-    return option, value
-
-
 def _next(words: Iterable[str], option: str) -> str:
-    value = next(iter(words), None)
-    if value is None:
+    if (value := next(iter(words), None)) is None:
         raise ConfigError(f"{option}: got no value; want {option}=VALUE")
     return value
 
 
 def first_index(array: str) -> str:
     """Return the first task of an `--array`: 4 of "4-9%2"."""
-    found = re.match(r"\d+", array)
-    if found is None:
+    if (found := re.match(r"\d+", array)) is None:
         raise ConfigError(f"--array: got {array!r}, want numbers, as in 0-15, 1,3,7 or 0-99%4")
     return found[0]
 

@@ -58,11 +58,8 @@ class SharedValues:
             key: [one.allocation.hex(), one.size, one.begin, one.counters.hex(), one.counter]
             for key, one in self.storages.items()
         }
-        return {
-            "gpu": self.gpu,
-            "storages": storages,
-            "views": {name: astuple(one) for name, one in self.views.items()},
-        }
+        views = {name: astuple(one) for name, one in self.views.items()}
+        return {"gpu": self.gpu, "storages": storages, "views": views}
 
     @classmethod
     def from_json(cls, node: dict[str, Any], others: Mapping[str, Any]) -> SharedValues:
@@ -152,8 +149,7 @@ class _GpuMemory:
         if torch is None or type(value) not in (torch.Tensor, torch.nn.Parameter):
             return ""
         # An empty tensor has no memory, and a sparse one has several.
-        on_gpu = value.is_cuda and value.layout == torch.strided and value.numel()
-        return self._uuid(value.device) if on_gpu else ""
+        return self._uuid(value.device) if value.is_cuda and value.layout == torch.strided and value.numel() else ""
 
     def finish(self, device: Any) -> None:
         """Wait for the work that this thread has queued on a GPU, since another process does not wait for it.

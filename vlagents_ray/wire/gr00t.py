@@ -251,8 +251,7 @@ def read_npy(data: Any, limits: Limits) -> Any:
     """Return the array in the bytes of an .npy file as a read-only view; an array of text as a list."""
     if not isinstance(data, bytes) or not data.startswith(_NPY) or len(data) < 12:
         raise MalformedMessage("gr00t: as_npy: not an .npy file")
-    long = data[6] > 1
-    start = 12 if long else 10
+    start = 12 if data[6] > 1 else 10
     length = int.from_bytes(data[8:start], "little")
     header = _HEADER.fullmatch(data[start : start + length]) if length < 1000 else None
     if header is None:

@@ -30,7 +30,7 @@ from typing import Any, Literal, TypeVar
 
 import numpy as np
 
-from vlagents_ray.contract import ActionSpec, Contract
+from vlagents_ray.contract import ActionSpec, Contract, closed
 from vlagents_ray.errors import (
     ConfigError,
     InvalidAction,
@@ -100,17 +100,6 @@ class ActionGripper:
     closed: float = 0.0
 
 
-def closed(cls: type, data: object, where: str) -> dict[str, Any]:
-    """Return the fields in `data`; raise `ConfigError` for a field that `cls` lacks."""
-    if not isinstance(data, Mapping):
-        raise ConfigError(f"{where}: got {type(data).__name__}, want an object")
-    known = [one.name for one in fields(cls)]
-    unknown = sorted(str(key) for key in data if key not in known)
-    if unknown:
-        raise ConfigError(f"{where}: unknown keys {unknown}, want some of {known}")
-    return dict(data)
-
-
 def each(top: Mapping[str, Any], name: str, read: Callable[[Any, str], T]) -> dict[str, T]:
     """Return the entries of `top[name]`, each the result of `read(value, where)`; `where` is its path, for errors."""
     entries = top.get(name) or {}
@@ -121,7 +110,7 @@ def each(top: Mapping[str, Any], name: str, read: Callable[[Any, str], T]) -> di
 
 def entry(cls: type[T], value: Any, where: str) -> T:
     """Return an entry of a mapping as the dataclass `cls`; a text is its key."""
-    values = closed(cls, {"key": value} if isinstance(value, str) else value, where)
+    values = closed(cls, {"key": value} if isinstance(value, str) else value, where, ConfigError)
     known = {one.name: str(one.type) for one in fields(cls)}  # type: ignore[arg-type]
     for name, got in values.items():
         if not _FITS[known[name]](got):
@@ -163,9 +152,7 @@ def stated(value: Any) -> Any:
     """Return `value` as plain JSON values, without fields that are None."""
     if isinstance(value, dict):
         return {name: stated(item) for name, item in value.items() if item is not None}
-    if isinstance(value, (list, tuple)):
-        return [stated(item) for item in value]
-    return value
+    return [stated(item) for item in value] if isinstance(value, (list, tuple)) else value
 
 
 # Paths into nested observations, such as `images/wrist`: either that key itself, or `wrist` within `images`.
@@ -258,8 +245,15 @@ def read_image(key: str, value: Any, layout: str, limits: Limits) -> np.ndarray:
     """Return an image as (H, W, 3) uint8 RGB; raise `InvalidObservation` or `MessageTooLarge`."""
     if isinstance(value, np.ndarray):
         value = _newest(key, value, 3)
-        if value.dtype.kind == "f":
-            value = _eight_bits(key, value)
+        if (
+            value.dtype.kind == "f"
+        ):  # converted as in openpi's own server (`_parse_image` in its policies): rounded down
+            if value.size and not (value.min() >= 0 and value.max() <= 1):  # also true for NaN
+                raise InvalidObservation(
+                    f"camera {key!r}: got {value.dtype} from {value.min():g} to {value.max():g}, want uint8, or floats "
+                    f"in [0, 1]; scale it"
+                )
+            value = (255 * value).astype(np.uint8)
         if layout == "rgba" and value.ndim == 3 and value.shape[2] == 4:
             value = np.ascontiguousarray(value[:, :, :3])
         elif layout in ("chw", "any") and value.ndim == 3 and value.shape[0] == 3:
@@ -267,16 +261,6 @@ def read_image(key: str, value: Any, layout: str, limits: Limits) -> np.ndarray:
         elif layout == "chw":
             raise InvalidObservation(f"camera {key!r}: got {value.shape} {value.dtype}, want (3, H, W) uint8 RGB")
     return as_camera(key, value, limits)
-
-
-def _eight_bits(key: str, image: np.ndarray) -> np.ndarray:
-    """Convert floats in [0, 1] to uint8, rounded down as in openpi's own server (`_parse_image` in its policies)."""
-    if image.size and not (image.min() >= 0 and image.max() <= 1):  # also true for NaN
-        raise InvalidObservation(
-            f"camera {key!r}: got {image.dtype} from {image.min():g} to {image.max():g}, want uint8, or floats "
-            f"in [0, 1]; scale it"
-        )
-    return (255 * image).astype(np.uint8)
 
 
 def may_be_camera(value: Any) -> bool:
@@ -375,7 +359,7 @@ class KeyMapping:
     @classmethod
     def from_json(cls, data: Mapping[str, Any]) -> KeyMapping:
         """Read a mapping from plain JSON values; raise `ConfigError` for an unknown key or a wrong type."""
-        top = closed(cls, data, "mapping")
+        top = closed(cls, data, "mapping", ConfigError)
         instruction = top.get("instruction")
         if instruction is not None and not isinstance(instruction, str):
             raise ConfigError(f"mapping.instruction: got {type(instruction).__name__}, want a key")
@@ -509,8 +493,7 @@ class KeyMapping:
         """Raise if `obs` has nothing of the client's observation, or none of its cameras or none of its states."""
         images = [camera.key for camera in self.cameras.values()]
         numbers = [part.key for sources in self.state.values() for part in sources]
-        grippers = [] if self.gripper is None else [self.gripper.key]
-        known = [*images, *numbers, *grippers]
+        known = [*images, *numbers, *([] if self.gripper is None else [self.gripper.key])]
         if known and not obs.cameras and not obs.state and obs.gripper is None:
             raise InvalidObservation(
                 f"observation: got {keys(flat)}, of which the mapping reads nothing; it looks for {known}: "

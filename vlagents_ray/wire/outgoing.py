@@ -85,16 +85,18 @@ class Outgoing:
 
     def contract(self) -> Contract:
         """Return the contract that follows from the mapping: the policy's inputs and the commands of its gripper."""
-        mapping, named = self.mapping, _named
+        mapping = self.mapping
         grippers = {(one.open, one.closed) for one in mapping.action_gripper}
         opened, closed = grippers.pop() if len(grippers) == 1 else (None, None)
         stops = [one.stop for one in mapping.action.values()]
         return Contract(
-            cameras={name: CameraSpec() for name, one in mapping.cameras.items() if named(name) and not one.optional},
+            cameras={
+                name: CameraSpec() for name, one in mapping.cameras.items() if "*" not in name and not one.optional
+            },
             state={
                 name: StateSpec(dim=_width(parts))
                 for name, parts in mapping.state.items()
-                if named(name) and not all(part.optional for part in parts)
+                if "*" not in name and not all(part.optional for part in parts)
             },
             gripper=(self._own_gripper() and mapping.gripper is not None and not mapping.gripper.optional) or None,
             instruction=True if mapping.instruction is not None else None,
@@ -123,7 +125,7 @@ class Outgoing:
                 keys = [(_first(part.key).replace("*", _rest(matched, name)), part) for part in parts]
                 for key, part, values in _split(matched, vector, keys):
                     pieces.setdefault(key, []).append((part.start or 0, values))
-            if _named(name) and name not in obs.state and not all(part.optional for part in parts):
+            if "*" not in name and name not in obs.state and not all(part.optional for part in parts):
                 raise MissingState(name, have=obs.state)
         gripper = self.mapping.gripper
         if gripper is not None and self._own_gripper():
@@ -150,10 +152,6 @@ def _first(key: str) -> str:
     return key.partition("|")[0]
 
 
-def _named(name: str) -> bool:
-    return "*" not in name
-
-
 def _rest(name: str, pattern: str) -> str:
     return name.removeprefix(pattern.partition("*")[0])
 
@@ -162,7 +160,7 @@ def _matching(
     name: str, key: str, values: Mapping[str, np.ndarray], entries: Mapping[str, Any]
 ) -> list[tuple[str, np.ndarray]]:
     """Return the keys and values of one entry: of its name, or of all matches of its `*` without an entry."""
-    if _named(name):
+    if "*" not in name:
         return [(key, values[name])] if name in values else []
     return [
         (key.replace("*", _rest(one, name)), value)

@@ -274,7 +274,17 @@ def read_result(body: bytes | bytearray, compressed: bool, limit: int) -> tuple[
 
 def write_observation(observation: Mapping[str, Any]) -> str:
     """Return the argument of `act`: the instruction, and each robot's cameras, state and gripper, (1,)."""
-    robots = {name: _robot_fields(one) for name, one in observation.items() if isinstance(one, Mapping)}
+    robots = {}
+    for name, one in observation.items():
+        if isinstance(one, Mapping):
+            gripper = one.get("gripper")
+            robots[name] = {
+                "cameras": dict(one.get("cameras", {})),
+                "camera_data_type": "raw",
+                "gripper": float(gripper[0]) if isinstance(gripper, np.ndarray) else gripper,
+                **{part: one.get(part) for part in ("joints", "xyzrpy", "tquat")},
+                "info": dict(one.get("info", {})),
+            }
     return json_numpy.dumps(
         {
             "obs": robots,
@@ -299,18 +309,6 @@ def read_actions(text: str, limits: Limits = DEFAULT_LIMITS) -> dict[str, np.nda
         if isinstance(error, MalformedMessage):
             raise
         raise MalformedMessage(f"vlagents: steps of different lengths ({error})") from error
-
-
-def _robot_fields(one: Mapping[str, Any]) -> dict[str, Any]:
-    known = {name: one.get(name) for name in ("joints", "xyzrpy", "tquat")}
-    gripper = one.get("gripper")
-    return {
-        "cameras": dict(one.get("cameras", {})),
-        "camera_data_type": "raw",
-        "gripper": float(gripper[0]) if isinstance(gripper, np.ndarray) else gripper,
-        **known,
-        "info": dict(one.get("info", {})),
-    }
 
 
 def _row(robot: str, act: Any) -> np.ndarray:

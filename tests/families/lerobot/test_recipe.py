@@ -16,7 +16,7 @@ from benchmarks.checkpoints.recipes import write_checkpoint
 from tests.families.lerobot.conftest import FILTERS
 from vlagents_ray.errors import ConfigError
 from vlagents_ray.policies.lerobot import LeRobot
-from vlagents_ray.testing.agents import random_observation
+from vlagents_ray.testing import random_observation
 
 pytestmark = FILTERS
 

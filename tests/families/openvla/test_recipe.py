@@ -14,7 +14,7 @@ from tests.families.openvla.conftest import LIBRARIES
 from vlagents_ray.errors import ConfigError
 from vlagents_ray.policies.openvla.policy import OpenVLA
 from vlagents_ray.policies.openvla.prismatic import find_source
-from vlagents_ray.testing.agents import random_observation
+from vlagents_ray.testing import random_observation
 
 pytestmark = [pytest.mark.source("OPENVLA_SRC"), *LIBRARIES]
 

@@ -12,7 +12,7 @@ from benchmarks.checkpoints import weights
 from benchmarks.checkpoints.recipe import Recipe
 from benchmarks.checkpoints.recipes import write_checkpoint
 from vlagents_ray.policies.pi0 import Pi0
-from vlagents_ray.testing.agents import random_observation
+from vlagents_ray.testing import random_observation
 
 
 @pytest.mark.parametrize("shard_bytes", [weights.SHARD_BYTES, 200_000])

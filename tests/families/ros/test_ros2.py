@@ -34,7 +34,7 @@ from vlagents_ray.errors import ConfigError
 from vlagents_ray.robot import Guard, Watchdog, run_loop
 from vlagents_ray.robot.ros import RosRobot
 from vlagents_ray.robot.ros.links import Ros2
-from vlagents_ray.robot.ros.settings import settings_from
+from vlagents_ray.robot.ros.robot import settings_from
 from vlagents_ray.robot.safety import measured_state
 
 pytestmark = [

@@ -244,6 +244,11 @@ def test_an_ensemble_averages_what_the_chunks_say_of_a_tick() -> None:
     assert second[0] == pytest.approx((1 + 10) / 2, abs=0.1)
 
 
+def test_an_ensemble_of_single_rows_is_refused() -> None:
+    with pytest.raises(ConfigError, match="nothing to average"):
+        loaded(actions="ensemble", execute=1)
+
+
 @pytest.mark.parametrize("actions", ["queue", "ensemble"])
 def test_a_plan_in_whose_place_others_were_executed_is_dropped(actions: str) -> None:
     session = begun(loaded(actions=actions))

@@ -25,7 +25,7 @@ from vlagents_ray.errors import ConfigError, InvalidAction
 from vlagents_ray.robot import Guard, Watchdog, run_loop
 from vlagents_ray.robot.loop import LoopReport
 from vlagents_ray.robot.ros import RosRobot
-from vlagents_ray.robot.ros.settings import settings_from
+from vlagents_ray.robot.ros.robot import settings_from
 from vlagents_ray.robot.safety import measured_state
 
 STEP = 0.01

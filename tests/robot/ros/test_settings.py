@@ -13,7 +13,7 @@ import yaml
 import vlagents_ray.cli.robot as robot_command
 from vlagents_ray.errors import ConfigError
 from vlagents_ray.robot.ros import read_settings
-from vlagents_ray.robot.ros.settings import settings_from
+from vlagents_ray.robot.ros.robot import settings_from
 
 EXAMPLES = Path(__file__).parents[3] / "examples/ros"
 ARM: dict[str, Any] = {

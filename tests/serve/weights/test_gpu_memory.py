@@ -12,9 +12,8 @@ from fake_cuda import FakeCuda
 
 from vlagents_ray.interface import Act, Agent, Obs
 from vlagents_ray.serve.weights import ModelWeights, PushOptions, WeightsVersion
-from vlagents_ray.weights import pinned_copies, trainable
-from vlagents_ray.weights.pinned_copies import copy
-from vlagents_ray.weights.trainable import are_apart, fingerprint, portable
+from vlagents_ray.weights import trainable
+from vlagents_ray.weights.trainable import are_apart, copy, fingerprint, portable
 
 pytestmark = pytest.mark.torch
 
@@ -30,8 +29,8 @@ def cuda(monkeypatch: pytest.MonkeyPatch) -> FakeCuda:
     fake.install(monkeypatch)
     monkeypatch.setattr(trainable, "_AT_ONCE", PART // 4)
     monkeypatch.setattr(trainable, "_WORDS", PART // 40)
-    monkeypatch.setattr(pinned_copies, "_PART", PART)
-    monkeypatch.setattr(pinned_copies, "_USED", {})
+    monkeypatch.setattr(trainable, "_PART", PART)
+    monkeypatch.setattr(trainable, "_USED", {})
     return fake
 
 

@@ -7,6 +7,236 @@
 It needs a Vulkan device, for example Mesa's software one; `ManiSkill.missing()` reports a missing one.
 """
 
-from vlagents_ray.envs.maniskill.env import ManiSkill
+from __future__ import annotations
 
-__all__ = ["ManiSkill"]
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from vlagents_ray.contract import Contract
+from vlagents_ray.envs.base import BatchEnv, Options, Steps, episodes_of, one_row
+from vlagents_ray.envs.graphics import Renderer, render_probe
+from vlagents_ray.envs.maniskill.simulator import INSTRUCTIONS, Simulator, step_limits
+from vlagents_ray.envs.simulator import SimulatorEnv, require_sizes, without
+from vlagents_ray.errors import ConfigError, NotReset
+from vlagents_ray.interface import Act, Obs
+
+ON_GPU = ("gpu", "cuda", "physx_cuda")
+
+
+# The section "Evaluation" of ManiSkill 3's guide to reinforcement learning.
+PROTOCOL = {
+    "ignore_terminations": True,  # an episode continues to the step limit after success or failure
+    "reconfiguration_freq": 1,  # the scene is rebuilt for each episode, with other objects if the task draws them
+    "metrics": ["success_once", "success_at_end"],
+    "seeds": "one an environment",  # each episode has its own seed, which determines all its random draws
+}
+
+
+class ManiSkill(SimulatorEnv):
+    """One environment of one ManiSkill task.
+
+    Observation: the task's cameras; in `state` the arm's `joints` (without the fingers), `tquat` and
+    `xyzrpy`, the pose of the tool centre point in the robot's base frame; `gripper`; and, for scripted experts only,
+    `info["sim_state"]`, (D,) float32, ManiSkill's flat state observation, which includes the positions of
+    objects. Some goals, such as PickCube's, are hidden from cameras.
+
+    Action, in the default control mode `pd_ee_delta_pose`: (7,) in [-1, 1], of which the first three move the tool by
+    0.1 m per unit along the base's axes; the next three turn it about the base's axes by **minus** 0.1 rad per unit,
+    since ManiSkill scales them by their lower bound; the last is the gripper, 1 open, -1 closed. A robot without
+    gripper takes (6,). The arm lags behind its commands: a constant 1.0 moves it by about 0.03 m per step.
+
+    The env continues after success, so that success once and success at the end can both be measured,
+    and never reports `terminated`.
+    """
+
+    suite = "maniskill"
+
+    def __init__(
+        self,
+        task: str = "PushCube-v1",
+        *,
+        width: int = 224,
+        height: int = 224,
+        cameras: Sequence[str] | None = None,
+        control_mode: str | None = None,
+        instruction: str | None = None,
+        max_steps: int | None = None,
+        sim_backend: str = "physx_cpu",
+        render_backend: str = "auto",
+        shader: str | None = None,
+        reward_mode: str | None = None,
+        reconfigure: bool = True,
+    ) -> None:
+        """Make the environment; raises the errors of `make_env`. Other options are described in `SimulatorEnv`.
+
+        Args:
+            task: ManiSkill's id.
+            cameras: Cameras of the task to return; None selects all.
+            control_mode: None selects `pd_ee_delta_pose`, or the robot's own default if it lacks that.
+            instruction: None selects the task's, see `instruction_for`.
+            sim_backend: "physx_cpu", which is faster for a single environment, or "physx_cuda".
+            render_backend: "cpu", "gpu", or "auto": the GPU if both SAPIEN and torch can use it.
+            shader: ManiSkill's name, e.g. "minimal", "default"; None selects the task's own.
+            reward_mode: ManiSkill's name; None selects the task's own.
+            reconfigure: Rebuild the scene for each episode. Without it the dynamics of some tasks
+                (PlugCharger, PushT) depend on the previous episode; it saves about 15 ms per reset.
+        """
+        super().__init__(task)
+        self.max_steps, self._own_limit = step_limits(self._name, task, max_steps)
+        self._given_instruction = instruction
+        self._reconfigure = reconfigure
+        self._env = _simulator(
+            task,
+            width=width,
+            height=height,
+            shader=shader,
+            cameras=cameras,
+            sim_backend=sim_backend,
+            render_backend=render_backend,
+            control_mode=control_mode,
+            reward_mode=reward_mode,
+        )
+        self._resources.callback(self._env.close)
+        self._contract = self._env.contract(self._env.action)
+
+    @property
+    def instruction(self) -> str:
+        return self._alive().instructions()[0] if self._given_instruction is None else self._given_instruction
+
+    def reset(self, *, seed: int, options: Options | None = None) -> tuple[Obs, dict[str, Any]]:
+        """Begin the episode of `seed`, taken modulo 2^32; `options` are passed to ManiSkill's own reset."""
+        self._options = options or {}
+        return super().reset(seed=seed)
+
+    @classmethod
+    def tasks(cls) -> list[str]:
+        return sorted(INSTRUCTIONS)
+
+    @classmethod
+    def require_task(cls, task: str | None) -> None:
+        """Do nothing, since only ManiSkill knows the registered ids."""
+
+    @classmethod
+    def missing(cls) -> str | None:
+        if missing := without(("mani_skill", "sapien", "gymnasium", "torch"), "pip install 'vlagents-ray[maniskill]'"):
+            return missing
+        probe = render_probe()
+        return None if probe.ok else f"ManiSkill finds no Vulkan device to render on ({probe.error}); {probe.cure}"
+
+    @classmethod
+    def batched(cls, num_envs: int, **options: Any) -> BatchEnv | None:
+        """Make all environments in one simulator, if it runs on a GPU."""
+        return ManiSkillBatch(num_envs=num_envs, **options) if options.get("sim_backend") in ON_GPU else None
+
+    def renderer(self) -> Renderer | None:
+        found: Renderer | None = self._alive().renderer()
+        return found
+
+    def describe(self) -> dict[str, Any]:
+        return _described(self._alive(), self._reconfigure, self.max_steps, self._own_limit)
+
+    def _begin(self, seed: int, state: int) -> tuple[Obs, dict[str, Any]]:
+        now = self._env.reset([seed], {**self._options, **({"reconfigure": True} if self._reconfigure else {})})
+        return now.obs[0], {"success": now.success[0]}
+
+    def _advance(self, action: np.ndarray) -> tuple[Obs, float, bool, dict[str, Any]]:
+        now = self._env.step(action[np.newaxis], look=self.looked_at)
+        return now.obs[0], now.rewards[0], False, {"success": now.success[0]}
+
+
+class ManiSkillBatch(BatchEnv):
+    """`num_envs` environments of one ManiSkill task; observations and actions are those of `ManiSkill`.
+
+    Physics on the GPU and on the CPU are not bit-identical: do not mix their results.
+    """
+
+    def __init__(
+        self,
+        task: str = "PushCube-v1",
+        *,
+        num_envs: int,
+        instruction: str | None = None,
+        max_steps: int | None = None,
+        sim_backend: str = "physx_cuda",
+        reconfigure: bool = True,
+        **options: Any,
+    ) -> None:
+        """Make the environments with the options of `ManiSkill`, whose errors this raises.
+
+        `sim_backend` "physx_cpu" can only simulate a single environment.
+        """
+        if sim_backend not in ON_GPU and num_envs > 1:
+            raise ConfigError(
+                f"maniskill/{task}: {sim_backend} simulates one environment, not {num_envs}; want physx_cuda"
+            )
+        self.num_envs = num_envs
+        self.max_steps, self._own_limit = step_limits(f"maniskill/{task}", task, max_steps)
+        self._task = task
+        self._instruction = instruction
+        self._reconfigure = reconfigure
+        self._playing = self._steps = 0
+        self._simulator = _simulator(task, num_envs=num_envs, sim_backend=sim_backend, **options)
+        self._contract = self._simulator.contract(self._simulator.action)
+
+    @property
+    def contract(self) -> Contract:
+        return self._contract
+
+    @property
+    def instructions(self) -> list[str]:
+        own = self._simulator.instructions() if self._instruction is None else [self._instruction] * self.num_envs
+        return own[: self._playing]
+
+    def reset(self, *, seeds: Sequence[int], options: Sequence[Options | None] | None = None) -> list[Obs]:
+        """Begin the episodes of `seeds`, taken modulo 2^32; the options are passed to ManiSkill's own reset."""
+        self._playing, self._steps = episodes_of(seeds, self.num_envs), 0
+        spare = self.num_envs - self._playing
+        every = [*seeds, *[seeds[-1]] * spare]
+        given: list[Options] = [*(option or {} for option in options or [{}] * self._playing), *[{}] * spare]
+        if self._reconfigure:
+            self._simulator.reset(every, {"reconfigure": True})
+        return self._simulator.reset_each(every, given).obs[: self._playing]
+
+    def step(self, acts: Sequence[Act | None]) -> Steps:
+        if not self._playing:
+            raise NotReset(f"maniskill/{self._task}: step before reset; call reset(seeds=...) first")
+        actions = np.zeros((self.num_envs, self._contract.action.dim or 0), np.float32)
+        for i, act in enumerate(acts):
+            if act is not None:
+                actions[i] = one_row(act, self._contract)
+        now = self._simulator.step(actions, look=self.looked_at)
+        self._steps += 1
+        n = self._playing
+        over = self._steps >= self.max_steps
+        infos = [{"success": success} for success in now.success[:n]]
+        return now.obs[:n], now.rewards[:n], [False] * n, [over] * n, infos
+
+    def renderer(self) -> Renderer | None:
+        return self._simulator.renderer()
+
+    def describe(self) -> dict[str, Any]:
+        return _described(self._simulator, self._reconfigure, self.max_steps, self._own_limit)
+
+    def close(self) -> None:
+        self._playing = 0
+        self._simulator.close()
+
+
+def _simulator(
+    task: str, *, width: int = 224, height: int = 224, shader: str | None = None, **options: Any
+) -> Simulator:
+    name = f"maniskill/{task}"
+    require_sizes(name, width=width, height=height)
+    sensors = {"width": width, "height": height} | ({"shader_pack": shader} if shader else {})
+    return Simulator(name, task, obs_mode="rgb+state", sensors=sensors, **options)
+
+
+def _described(simulator: Simulator, reconfigure: bool, max_steps: int, own_limit: int | None) -> dict[str, Any]:
+    deviations = []
+    if not reconfigure:
+        deviations.append("reconfigure is False: scenes are kept from episode to episode")
+    if max_steps != own_limit:
+        deviations.append(f"max_steps is {max_steps}, the task's own is {own_limit}")
+    return simulator.describe() | {"reconfigure": reconfigure, "protocol": {**PROTOCOL, "deviations": deviations}}

@@ -20,9 +20,8 @@ import numpy as np
 
 from vlagents_ray.contract import ActionSpec, CameraSpec, Contract, StateSpec
 from vlagents_ray.envs.base import require_cameras
-from vlagents_ray.envs.graphics import Renderer, prepare_rendering, vulkan_renderer
-from vlagents_ray.envs.render_probe import failing, vulkan_cure, vulkan_device
-from vlagents_ray.envs.simulator import require_sizes
+from vlagents_ray.envs.graphics import Renderer, prepare_rendering, vulkan_device, vulkan_renderer
+from vlagents_ray.envs.simulator import failing, require_sizes
 from vlagents_ray.errors import ConfigError, EnvFailed, UnknownEnv
 from vlagents_ray.interface import Obs
 from vlagents_ray.registry import require
@@ -66,8 +65,7 @@ def step_limits(env: str, task: str, wanted: int | None) -> tuple[int, int | Non
     if task not in registered:
         raise UnknownEnv(f"maniskill has no task {task!r}: want one of {sorted(INSTRUCTIONS)}, or another of its ids")
     own: int | None = registered[task].max_episode_steps
-    limit = own if wanted is None else wanted
-    if limit is None:
+    if (limit := own if wanted is None else wanted) is None:
         raise ConfigError(f"{env} has no step limit of its own; set max_steps")
     require_sizes(env, max_steps=limit)
     return limit, own
@@ -97,7 +95,7 @@ def make_bare(task: str, control_mode: str | None, *, sim_backend: str, render_b
     given = {name: value for name, value in options.items() if value is not None}
     given |= {"sim_backend": sim_backend, "render_backend": render_backend}
     gymnasium = require("gymnasium")
-    with _no_prompts(task), _named_errors(task), warnings.catch_warnings():
+    with _no_prompts(task), failing(f"maniskill/{task}", "make"), warnings.catch_warnings():
         # the digital twin of the cubes makes a tensor from a list of arrays: 24 rows, once
         warnings.filterwarnings("ignore", "Creating a tensor from a list of numpy", UserWarning)
         _keep_renderer(sim_backend, render_backend)
@@ -109,18 +107,6 @@ def make_bare(task: str, control_mode: str | None, *, sim_backend: str, render_b
             if control_mode is not None:
                 raise ConfigError(f"maniskill/{task}: control_mode {error}") from error
         return gymnasium.make(task, **given).unwrapped
-
-
-@contextlib.contextmanager
-def _named_errors(task: str) -> Iterator[None]:
-    try:
-        yield
-    except ConfigError:
-        raise
-    except Exception as error:
-        about_vulkan = re.search(r"vk::|rendering device|Vulkan", str(error))
-        cure = f"; {vulkan_cure()}" if about_vulkan else ""
-        raise EnvFailed(f"maniskill/{task} could not be made: {type(error).__name__}: {error}{cure}") from error
 
 
 @contextlib.contextmanager
@@ -150,7 +136,10 @@ def _prepare_process() -> None:
     # which are not garbage.
     gc.collect()
     gc.freeze()
-    logging.getLogger("mani_skill ").addFilter(_not_about_its_own_code)  # the name ends with a space
+    # Tasks and robots repeat these warnings at each reconfiguration, and no user can act on them. The logger's name
+    # ends with a space.
+    repeated = ("No initial pose set for ", "Mimic targets dictionary is missing")
+    logging.getLogger("mani_skill ").addFilter(lambda record: not record.getMessage().startswith(repeated))
 
 
 @functools.cache
@@ -165,11 +154,6 @@ def _keep_renderer(sim_backend: str, render_backend: str) -> object:
     parse = require("mani_skill.envs.utils.system.backend").parse_sim_and_render_backend
     device = parse(sim_backend, render_backend).render_device
     return None if device is None else sapien.render.RenderSystem(device)
-
-
-def _not_about_its_own_code(record: logging.LogRecord) -> bool:
-    """Drop warnings that some tasks and robots repeat at each reconfiguration, and that no user can act on."""
-    return not record.getMessage().startswith(("No initial pose set for ", "Mimic targets dictionary is missing"))
 
 
 # Position of a finger's joint when closed and when open, m, by ManiSkill's name of the robot. The last component of an
@@ -205,8 +189,7 @@ class ManiSkillRobot:
 
     def __init__(self, agent: Any) -> None:
         names = [joint.name for joint in agent.robot.active_joints]
-        arm = getattr(agent, "arm_joint_names", names)
-        self._arm = np.array([names.index(name) for name in arm])
+        self._arm = np.array([names.index(name) for name in getattr(agent, "arm_joint_names", names)])
         self._finger_m = _FINGER_M.get(agent.uid)
         self.has_gripper = self._finger_m is not None
         self._fingers = np.array([names.index(name) for name in getattr(agent, "gripper_joint_names", ())], dtype=int)
@@ -235,8 +218,7 @@ class ManiSkillRobot:
         if self._finger_m is None:
             return None
         closed, opened = self._finger_m
-        opening = (float(qpos[self._fingers].mean()) - closed) / (opened - closed)
-        return min(max(opening, 0.0), 1.0)
+        return min(max((float(qpos[self._fingers].mean()) - closed) / (opened - closed), 0.0), 1.0)
 
 
 def _tool(agent: Any) -> Any:
@@ -410,8 +392,7 @@ class Simulator:
         for i, (state, gripper) in enumerate(self._robot.read(env.agent)):
             extra = {} if states is None else {"sim_state": states[i]}
             seen.append(Obs({name: rows[i] for name, rows in images.items()}, gripper, state, extra))
-        success = [bool(value) for value in info["success"]]
-        return Moment(seen, success, [0.0] * len(seen))
+        return Moment(seen, [bool(value) for value in info["success"]], [0.0] * len(seen))
 
     def renderer(self) -> Renderer | None:
         found = vulkan_device(on_gpu=self.alive().backend.render_device.is_cuda())

@@ -11,6 +11,195 @@ metres. The camera "front" looks down at an elevation of 70 degrees without pers
 The camera "wrist" shows a third of that, enlarged, with the fingertips in its centre.
 """
 
-from vlagents_ray.envs.tabletop.env import Tabletop
+from __future__ import annotations
 
-__all__ = ["Tabletop"]
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from typing import Any, get_args
+
+import numpy as np
+
+from vlagents_ray.contract import CameraSpec, Contract, StateSpec
+from vlagents_ray.envs.base import DELTA_POSE, EvalEnv, one_row, require_cameras, require_known
+from vlagents_ray.envs.tabletop.render import ELEVATION, VIEW, TabletopRenderer, WristRenderer
+from vlagents_ray.envs.tabletop.world import PUCKS, STEP_LIMIT, Goal, TabletopWorld, Task, draw_episode, goals
+from vlagents_ray.errors import ConfigError, NotReset
+from vlagents_ray.interface import Act, Obs
+
+MIXED = "mixed"
+_RENDERERS = {"front": TabletopRenderer, "wrist": WristRenderer}
+_TASKS: tuple[Task, ...] = get_args(Task)
+_DISTURBED = 0.1  # share of steps
+_VERSION = 1  # of the scenes and the physics; results of different versions are not comparable
+_CONTROL_HZ = 10.0
+_POINTING_DOWN = (math.pi, 0.0, 0.0)  # roll, pitch, yaw of the gripper in rad, constant
+
+
+class Tabletop(EvalEnv):
+    """Four pucks, three pads and one instruction about them, e.g. "put the red puck on the blue pad".
+
+    Tasks: `pick_place`, `slide` (never lift the puck), `stack`, `lift`, and `mixed`, the default, which draws one of
+    them for each episode.
+
+    Observation: cameras (height, width, 3), by default "front" alone, of "front" and "wrist"; `state["xyzrpy"]` (6,),
+    the fingertips' position in m and the gripper's constant orientation in rad, in the base frame of the package's
+    docstring; `gripper` in [0, 1], 1 = open, about 0.58 around a puck. With `object_state`, also `state["puck"]` (3,),
+    the position of the underside of the instruction's puck, and `state["target"]` (3,), its target; m, in the base
+    frame.
+
+    Action (4,): `dx, dy, dz` in units of 0.03 m per step along the base frame's axes, and the gripper, 1 = open, -1 =
+    closed. Components outside [-1, 1] are clipped, as by a robot's controller.
+
+    The reward is 1.0 in each step that ends in success, else 0.0. Nothing terminates an episode.
+    """
+
+    def __init__(
+        self,
+        task: str | None = None,
+        *,
+        width: int = 224,
+        height: int = 224,
+        cameras: Sequence[str] = ("front",),
+        max_steps: int = 80,
+        pucks: int = PUCKS,
+        object_state: bool = False,
+        disturbance: float = 0.0,
+    ) -> None:
+        """Make the environment of a task.
+
+        Args:
+            task: One of `tasks()`; None selects `mixed`.
+            width: The width of the image, at least 32 pixels.
+            height: The height of the image, at least 32 pixels.
+            cameras: Of "front" and "wrist".
+            max_steps: Steps until truncation.
+            pucks: Pucks on the table, 1 to 4. A policy without instructions can identify its puck only if it is alone.
+            object_state: Whether the state has the positions of the instruction's puck and of its target.
+            disturbance: Standard deviation of what is added to the motion of one step in ten, in units of an action;
+                demonstrations with it show how to recover from errors (DART, arXiv 1703.09327).
+
+        Raises:
+            ConfigError: There is no such task, or a number is out of its range.
+        """
+        self.require_task(task)
+        self._task = task or MIXED
+        self._tasks = [one for one in _TASKS if self._task in (MIXED, one)]
+        fewest = 2 if self._task in (MIXED, "stack") else 1
+        ranges: dict[str, tuple[float, int, int | None]] = {
+            "width": (width, 32, None),
+            "height": (height, 32, None),
+            "max_steps": (max_steps, 1, None),
+            "pucks": (pucks, fewest, PUCKS),
+            "disturbance": (disturbance, 0, 1),
+        }
+        for name, (value, least, most) in ranges.items():
+            if value < least or (most is not None and value > most):
+                wanted = f"at least {least}" if most is None else f"{least} to {most} in {self._task!r}"
+                raise ConfigError(f"tabletop: {name} is {value}, want {wanted}")
+        require_cameras("tabletop", cameras, _RENDERERS)
+        self.max_steps, self._disturbance = max_steps, disturbance
+        self._pucks, self._object_state = pucks, object_state
+        self._contract = self.known_contract(
+            {"width": width, "height": height, "cameras": cameras, "object_state": object_state}
+        )
+        self._renderers = {name: _RENDERERS[name](width, height) for name in cameras}
+        self._draws = np.random.default_rng()
+        self._world: TabletopWorld | None = None
+        self._goal: Goal | None = None
+        self._steps = 0
+
+    @classmethod
+    def require_task(cls, task: str | None) -> None:
+        require_known("tabletop", task or MIXED, cls.tasks())
+
+    @classmethod
+    def tasks(cls) -> list[str]:
+        return [MIXED, *_TASKS]
+
+    @classmethod
+    def known_contract(cls, arguments: Mapping[str, Any]) -> Contract:
+        objects = {"puck": StateSpec(3, "m"), "target": StateSpec(3, "m")}
+        return Contract(
+            cameras={
+                name: CameraSpec(arguments["height"], arguments["width"])
+                for name in arguments.get("cameras", ("front",))
+            },
+            state={"xyzrpy": StateSpec(6, "m+rad")} | (objects if arguments.get("object_state") else {}),
+            gripper=True,
+            instruction=True,
+            action=replace(
+                DELTA_POSE, dim=4, space="ee_position", rotation="none", gripper_open=1.0, gripper_closed=-1.0
+            ),
+            control_hz=_CONTROL_HZ,
+        )
+
+    @property
+    def contract(self) -> Contract:
+        return self._contract
+
+    @property
+    def instruction(self) -> str:
+        if self._goal is None:
+            raise NotReset("tabletop: there is no instruction before the first reset(seed=...)")
+        return self._goal.instruction
+
+    def describe(self) -> dict[str, Any]:
+        return {
+            "version": _VERSION,
+            "task": self._task,
+            "control_mode": "ee_delta_position",
+            "metres_per_unit": STEP_LIMIT,
+            "camera": {"elevation_deg": round(math.degrees(ELEVATION), 6), "view_m": VIEW},
+            "numpy": np.__version__,
+        }
+
+    def reset(self, *, seed: int, options: Mapping[str, Any] | None = None) -> tuple[Obs, dict[str, Any]]:
+        """Begin an episode. The only option, `instruction`, sets another goal in the same scene.
+
+        `info["instructions"]` lists the instructions of the episode's task that are possible in this scene.
+        """
+        if unknown := sorted(set(options or {}) - {"instruction"}):
+            raise ConfigError(f"tabletop: unknown reset options {unknown}, want none or 'instruction'")
+        rng = np.random.default_rng(seed % 2**64)  # numpy accepts no negative seed
+        task = self._tasks[rng.integers(len(_TASKS)) if self._task == MIXED else 0]
+        world, goal = draw_episode(task, rng, self._pucks)
+        if options:
+            goal = self._chosen(world, options["instruction"])
+        self._world, self._goal, self._steps, self._draws = world, goal, 0, rng
+        for renderer in self._renderers.values():
+            renderer.begin(world.pads)
+        info = {"instructions": [g.instruction for g in goals(world, goal.task)], "success": False}
+        return self._observe(world, goal), info
+
+    def step(self, act: Act) -> tuple[Obs, float, bool, bool, dict[str, Any]]:
+        world, goal = self._world, self._goal
+        if world is None or goal is None:
+            raise NotReset("tabletop: step before reset; call reset(seed=...) first")
+        action = one_row(act, self._contract)
+        if self._disturbance and self._draws.random() < _DISTURBED:
+            action = action + np.append(self._draws.normal(0.0, self._disturbance, 3), 0.0)
+        dx, dy, dz, grip = np.clip(action, -1.0, 1.0).tolist()
+        world.step(dx * STEP_LIMIT, dy * STEP_LIMIT, dz * STEP_LIMIT, (grip + 1) / 2)
+        self._steps += 1
+        success = goal.reached(world)
+        obs = self._observe(world, goal, look=self.looked_at)
+        return obs, float(success), False, self._steps >= self.max_steps, {"success": success}
+
+    def close(self) -> None:
+        self._world = self._goal = None
+
+    def _observe(self, world: TabletopWorld, goal: Goal, *, look: bool = True) -> Obs:
+        state = {"xyzrpy": np.array((world.x, world.y, world.z, *_POINTING_DOWN), np.float32)}
+        if self._object_state:
+            puck = world.puck(goal.puck)
+            state["puck"] = np.array((puck.x, puck.y, puck.z), np.float32)
+            state["target"] = np.array(goal.place(world), np.float32)
+        cameras = {name: renderer.draw(world) for name, renderer in self._renderers.items()} if look else {}
+        return Obs(cameras=cameras, gripper=world.opening, state=state)
+
+    def _chosen(self, world: TabletopWorld, instruction: object) -> Goal:
+        possible = {goal.instruction: goal for task in self._tasks for goal in goals(world, task)}
+        if instruction not in possible:
+            raise ConfigError(f"tabletop: got instruction {instruction!r}, want one of this scene's: {list(possible)}")
+        return possible[str(instruction)]

@@ -70,7 +70,9 @@ class TabletopRenderer:
         resting = [p for p in world.pucks if p is not world.held]
         key = tuple([(p.x, p.y, p.z) for p in resting])
         if key != self._still_key:
-            self._still, self._still_key = self._draw_still(resting), key
+            self._still, self._still_key = self._floor_picture.copy(), key
+            for puck in sorted(resting, key=lambda p: (p.z, -p.y)):  # near ones over far ones, upper over lower
+                self._draw_puck_at(self._still, puck)
         image = self._still.copy()
         self._shade(image, self._gripper_shadow, world.x, world.y, world.z + _FINGER_LENGTH)
         if world.held is not None:
@@ -80,12 +82,6 @@ class TabletopRenderer:
             self._grippers[gap] = self._draw_gripper(float(gap))
         self._blend(image, self._grippers[gap], world.x, world.y, world.z)
         return image
-
-    def _draw_still(self, pucks: list[Puck]) -> np.ndarray:
-        picture = self._floor_picture.copy()
-        for puck in sorted(pucks, key=lambda p: (p.z, -p.y)):  # near ones over far ones, upper over lower
-            self._draw_puck_at(picture, puck)
-        return picture
 
     def _draw_puck_at(self, image: np.ndarray, puck: Puck) -> None:
         self._shade(image, self._puck_shadow, puck.x, puck.y, puck.z + PUCK_HEIGHT / 3)
@@ -166,8 +162,7 @@ class TabletopRenderer:
             canvas.paint(
                 np.asarray(_FINGER) * 0.72, canvas.box(u, -length / 2, finger, length / 2 + finger / 2, finger / 2)
             )
-            lit = canvas.box(u - finger * 0.25, -length / 2, finger * 0.6, length / 2, finger / 2)
-            canvas.paint(_FINGER, lit)
+            canvas.paint(_FINGER, canvas.box(u - finger * 0.25, -length / 2, finger * 0.6, length / 2, finger / 2))
         canvas.paint(_PALM_FRONT, canvas.box(0, above + front / 2, half, tall * self._up + front / 2, 0.008 * s))
         canvas.paint(_PALM, canvas.box(0, above, half, tall * self._up, 0.008 * s))
         canvas.paint((48, 49, 51), 0.6 * canvas.glow(0, above, 0.03 * s, 0.024 * s))

@@ -91,6 +91,7 @@ class TabletopWorld:
             self._push()
 
     def _push(self) -> None:
+        reach, offset = PUCK_RADIUS + FINGER_RADIUS, self.gap + FINGER_RADIUS
         for puck in self.pucks:
             if puck is self.held or puck.z + PUCK_HEIGHT <= self.z + _EPSILON:
                 continue
@@ -98,21 +99,16 @@ class TabletopWorld:
                 slack = max(self.gap - PUCK_RADIUS, 0.0)
                 puck.x = _clip(puck.x, (self.x - slack, self.x + slack))
                 continue
-            self._push_by_fingers(puck)
+            for _ in range(_CONTACT_PASSES):
+                # both fingers push at once: in sequence they would push a centred puck aside
+                pushes = [_overlap(puck, self.x + side * offset, self.y, reach) for side in (-1.0, 1.0)]
+                puck.x += sum(push[0] for push in pushes if push)
+                puck.y += sum(push[1] for push in pushes if push)
+                if not any(pushes):
+                    break
         for _ in range(len(self.pucks)):  # a pushed puck pushes the next
             if not self._separate():
                 break
-
-    def _push_by_fingers(self, puck: Puck) -> None:
-        reach = PUCK_RADIUS + FINGER_RADIUS
-        offset = self.gap + FINGER_RADIUS
-        for _ in range(_CONTACT_PASSES):
-            # both fingers push at once: in sequence they would push a centred puck aside
-            pushes = [_overlap(puck, self.x + side * offset, self.y, reach) for side in (-1.0, 1.0)]
-            if not any(pushes):
-                return
-            puck.x += sum(push[0] for push in pushes if push)
-            puck.y += sum(push[1] for push in pushes if push)
 
     def _separate(self) -> bool:
         moved = False
@@ -135,8 +131,7 @@ class TabletopWorld:
     def _raise(self, dz: float) -> None:
         z = _clip(self.z + dz, REACH[2])
         if self.held is not None:
-            under = self._support(self.held)
-            z = max(z, self.z + under - self.held.z)
+            z = max(z, self.z + self._support(self.held) - self.held.z)
         elif dz < 0:
             for puck in self.pucks:
                 top = puck.z + PUCK_HEIGHT

@@ -120,6 +120,7 @@ def whole_folder(path: Path) -> Iterator[Path]:
         part = Path(temporary) / path.name
         part.mkdir()
         yield part
+        os.sync()  # one for all its files
         os.replace(part, path)
 
 

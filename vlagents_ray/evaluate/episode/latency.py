@@ -76,10 +76,19 @@ class ChunkExecutor:
         return self._plan.continuation(self._delays) if self._clock.real_time_chunking else {}
 
     def ticks(self, rows: np.ndarray, latency_s: float) -> Iterator[Tick]:
-        """Return the ticks until the next request, after an answer of `rows`, (H, D), with `latency_s`."""
+        """Return the ticks until the next request, after an answer of `rows`, (H, D), with `latency_s`.
+
+        Raises:
+            ConfigError: No row is left for real-time chunking.
+        """
         if not self._real_time:
             yield from map(Tick, rows[: self._execute])
             return
+        if self._clock.real_time_chunking and len(rows) <= (self._execute or len(rows)):
+            raise ConfigError(
+                f"clock.real_time_chunking: got chunks of {len(rows)} rows, all of which are executed before the next "
+                "request, so that nothing is left to continue; give an `execute` below that, and none in the policy"
+            )
         wait = math.ceil(latency_s * self._hz - _EXACTLY)
         self._delays.append(wait)
         asked = self._plan.executed

@@ -25,6 +25,7 @@ from vlagents_ray.errors import ConfigError
 from vlagents_ray.evaluate.artifacts.recorder import DEFAULT_FPS, Trajectory, videos_of
 from vlagents_ray.evaluate.artifacts.storage import link_or_copy, require_there, whole_folder
 from vlagents_ray.evaluate.results.reader import CellResults, Episode, Results
+from vlagents_ray.images.mp4 import rgb_converter
 from vlagents_ray.naming import did_you_mean, distinct
 from vlagents_ray.registry import require
 from vlagents_ray.robot.dataset import UNFINISHED, Dataset
@@ -139,7 +140,7 @@ def to_lerobot(
 
     angles = _angles(demonstrations())
     with whole_folder(path) as root:
-        dataset = Dataset(root, rates.pop())
+        dataset = Dataset(root, rates.pop(), durable=False)
         for one in demonstrations():
             finished = _finished(one, angles, root / UNFINISHED)
             if dataset.episodes and finished.features != dataset.info["features"]:
@@ -246,11 +247,11 @@ def _finished(one: _Demonstration, angles: Mapping[int, Centre], folder: Path) -
     images: dict[str, Stats] = {}
     videos: dict[str, Path] = {}
     for camera, video in one.videos.items():
-        key, seen = keys[camera], ImageStatistics()
+        key, seen, convert = keys[camera], ImageStatistics(), rgb_converter()
         with require("av").open(str(video)) as container:
             stream = container.streams.video[0]
             for frame in islice(container.decode(stream), len(one.actions)):
-                seen.add(frame.to_ndarray(format="rgb24"))
+                seen.add(convert(frame))
             images[key], features[key] = seen.result(), video_feature(stream.height, stream.width, _fps(one.cell))
         videos[key] = folder / f"{key}.mp4"
         link_or_copy(video, videos[key])

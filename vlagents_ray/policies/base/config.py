@@ -96,6 +96,12 @@ class ModelConfig(BaseModel, extra="forbid"):
         return self
 
     @model_validator(mode="after")
+    def _chunks_of_an_ensemble_overlap(self) -> Self:
+        if self.actions == "ensemble" and self.execute == 1:
+            raise ValueError("execute: got 1 with actions 'ensemble', which leaves nothing to average; leave it out")
+        return self
+
+    @model_validator(mode="after")
     def _adapters_are_added_to_eager_whole_layers(self) -> Self:
         for name, value in (("compile", self.compile not in (False, "auto")), ("quantization", self.quantization)):
             if self.adapters and value:

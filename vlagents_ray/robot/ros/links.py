@@ -216,7 +216,10 @@ class Rosbridge:
                     if not socket.ping().wait(_SILENT_S):  # its other end is gone, as after a power failure
                         self._lose(socket)
                         continue
-                self._ask_silent_again(socket)
+                for topic, at in self._heard.items():
+                    if time.monotonic() - at > _SILENT_S:
+                        socket.send(json.dumps({"op": "unsubscribe", "topic": topic}))
+                        self._ask_for(topic, socket)
             except (ConnectionClosed, OSError):
                 self._lose(socket)
 
@@ -225,12 +228,6 @@ class Rosbridge:
         request = {"op": "subscribe", "topic": topic, "type": self._types[topic], "queue_length": 1}
         socket.send(json.dumps(request))
         self._heard[topic] = time.monotonic()
-
-    def _ask_silent_again(self, socket: ClientConnection) -> None:
-        for topic, at in self._heard.items():
-            if time.monotonic() - at > _SILENT_S:
-                socket.send(json.dumps({"op": "unsubscribe", "topic": topic}))
-                self._ask_for(topic, socket)
 
     def _reconnect(self) -> None:
         try:

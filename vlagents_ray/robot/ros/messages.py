@@ -137,8 +137,13 @@ def pose(message: Any, rotation: PoseRotation = "quat_xyzw") -> np.ndarray:
     quaternion = quaternion / length
     if rotation == "quat_wxyz":
         quaternion = quaternion[[3, 0, 1, 2]]
-    turn = _euler_xyz(*quaternion.tolist()) if rotation == "euler_xyz" else quaternion
-    return _finite("pose", np.concatenate([position, turn]))
+    if rotation == "euler_xyz":
+        x, y, z, w = quaternion.tolist()
+        roll = math.atan2(2 * (w * x + y * z), 1 - 2 * (x * x + y * y))
+        pitch = math.asin(min(1.0, max(-1.0, 2 * (w * y - z * x))))
+        yaw = math.atan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
+        return _finite("pose", np.array([*position, roll, pitch, yaw]))
+    return _finite("pose", np.concatenate([position, quaternion]))
 
 
 def numbers(message: Any) -> np.ndarray:
@@ -215,10 +220,3 @@ def _finite(name: str, values: np.ndarray) -> np.ndarray:
     if not np.isfinite(found).all():
         raise MalformedMessage(f"{name}: got {values.tolist()}, want finite numbers; is the sensor broken?")
     return found
-
-
-def _euler_xyz(x: float, y: float, z: float, w: float) -> np.ndarray:
-    roll = math.atan2(2 * (w * x + y * z), 1 - 2 * (x * x + y * y))
-    pitch = math.asin(min(1.0, max(-1.0, 2 * (w * y - z * x))))
-    yaw = math.atan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
-    return np.array([roll, pitch, yaw])

@@ -29,7 +29,7 @@ from vlagents_ray.serve.models.loaded_model import LoadedModel, Loader, key_of
 from vlagents_ray.serve.requests import DEFAULT, CheckpointChoice
 from vlagents_ray.serve.sessions import Session, SessionTable
 from vlagents_ray.serve.weights import ModelWeights
-from vlagents_ray.weights.pinned_copies import beside_acts
+from vlagents_ray.weights.trainable import beside_acts
 
 PATIENCE_S = 10.0  # waiting time for a slot after which a checkpoint in use accepts no more episodes
 

@@ -1,0 +1,554 @@
+"""Test suites for policies and environments, which all those of this package pass and yours can also use.
+
+    from vlagents_ray.testing import check_agent, check_env
+
+    def test_my_env_keeps_its_contract():
+        check_env(MyEnv())
+
+    def test_my_policy_keeps_its_contract():
+        check_agent(MyPolicy())
+
+Each raises `ContractViolation` with the first violation that it finds, and closes the agent or environment.
+"""
+
+from __future__ import annotations
+
+import copy
+import sys
+import threading
+import time
+from collections.abc import Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
+from dataclasses import dataclass, fields, is_dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from vlagents_ray.contract import CameraSpec, Contract, StateSpec
+from vlagents_ray.envs.base import EvalEnv, kind_of
+from vlagents_ray.errors import InvalidAction, InvalidObservation, VLAgentsError
+from vlagents_ray.interface import Act, Agent, Obs
+from vlagents_ray.validation import check_action, check_observation
+
+__all__ = ["ContractViolation", "check_agent", "check_env"]
+
+_SCALARS = (bool, int, float, str, bytes)
+_SIDE = 64  # px, of a random image whose size the contract does not state
+_DIM = 7  # length of a part of the state whose size the contract does not state
+_SESSIONS = 3
+_THREADS = 4  # number of threads that prepare observations in a server
+_ROUNDS = 20  # acts concurrent with those threads, each after `_RESETS` resets
+_RESETS = 15  # since a reset is short, few of them coincide with a preparation
+_LONGEST_S = 5.0  # time after which no further act begins, since other threads slow down the agent
+_SWITCH_S = 1e-5  # Python's switch interval, short so that threads interleave more often
+
+
+class ContractViolation(VLAgentsError):
+    """A policy or an environment does not implement its interface; the message names the place."""
+
+
+def require_wireable(value: object, where: str) -> None:
+    """Raise `ContractViolation` unless a message can carry `value`."""
+    if value is None or type(value) in _SCALARS:
+        return
+    if isinstance(value, np.ndarray):
+        if value.dtype.kind not in "biuf":
+            raise ContractViolation(f"{where}: got an array of {value.dtype}, want numbers or bools")
+    elif isinstance(value, dict):
+        for key, item in value.items():
+            if not isinstance(key, str):
+                raise ContractViolation(f"{where}: got the key {key!r}, want only str keys")
+            require_wireable(item, f"{where}[{key!r}]")
+    elif isinstance(value, list):
+        for i, item in enumerate(value):
+            require_wireable(item, f"{where}[{i}]")
+    else:
+        raise ContractViolation(
+            f"{where}: got {type(value).__module__}.{type(value).__qualname__}, which a message cannot carry; "
+            f"want None, bool, int, float, str, bytes, numpy arrays, lists and dicts of them"
+        )
+
+
+def difference(a: object, b: object, where: str, atol: float = 0.0) -> str | None:
+    """Describe the first difference between two values.
+
+    Returns:
+        The description; None if the values are equal.
+    """
+    if a is b:
+        return None
+    a, b = _plain(a), _plain(b)
+    if isinstance(a, np.ndarray) and isinstance(b, np.ndarray):
+        return _array_difference(a, b, where, atol)
+    if isinstance(a, Mapping) and isinstance(b, Mapping):
+        if a.keys() != b.keys():
+            return f"{where} has {sorted(a)} once and {sorted(b)} the other time"
+        found_inside = (difference(a[key], b[key], f"{where}[{key!r}]", atol) for key in a)
+        return next((found for found in found_inside if found), None)
+    if isinstance(a, (list, tuple)) and isinstance(b, (list, tuple)):
+        if len(a) != len(b):
+            return f"{where} has {len(a)} items once and {len(b)} the other time"
+        in_items = (difference(x, y, f"{where}[{i}]", atol) for i, (x, y) in enumerate(zip(a, b, strict=True)))
+        return next((found for found in in_items if found), None)
+    return None if type(a) is type(b) and a == b else f"{where} is {a!r} once and {b!r} the other time"
+
+
+def _plain(value: object) -> object:
+    """Convert tensors and images to arrays, and objects that have attributes but no equality to dictionaries."""
+    if isinstance(value, Act):  # without its info, which may contain times
+        return {"action": value.action, "done": value.done}
+    if isinstance(value, Obs):
+        return {name: getattr(value, name) for name in ("cameras", "gripper", "state", "info")}
+    if is_dataclass(value) and not isinstance(value, type):
+        return {part.name: getattr(value, part.name) for part in fields(value)}
+    if hasattr(value, "__array__") and not isinstance(value, (np.ndarray, np.generic)):
+        return np.asarray(value.float() if "bfloat16" in str(getattr(value, "dtype", "")) else value)  # type: ignore[attr-defined]
+    return vars(value) if type(value).__eq__ is object.__eq__ and hasattr(value, "__dict__") else value
+
+
+def _array_difference(a: np.ndarray, b: np.ndarray, where: str, atol: float) -> str | None:
+    if a.shape != b.shape or a.dtype != b.dtype:
+        return f"{where} is {a.shape} {a.dtype} once and {b.shape} {b.dtype} the other time"
+    if np.array_equal(a, b, equal_nan=a.dtype.kind == "f"):
+        return None
+    off = np.abs(a.astype(np.float64) - b.astype(np.float64))
+    if off.max() <= atol:
+        return None
+    return f"{where} differs in {np.count_nonzero(off > atol)} of {a.size} numbers, by up to {off.max():.4g}"
+
+
+def require_same(a: Any, b: Any, where: str, because: str, atol: float = 0.0) -> None:
+    """Raise `ContractViolation` with the difference and the reason `because` unless two values are equal."""
+    if found := difference(a, b, where, atol):
+        raise ContractViolation(f"{found}; {because}")
+
+
+def check_close(made: Agent | EvalEnv) -> None:
+    """Close an agent or an environment twice, which must be safe."""
+    for attempt in ("first", "second"):
+        try:
+            made.close()
+        except Exception as error:
+            raise ContractViolation(
+                f"close: the {attempt} call raised {error!r}; it must be safe to call twice"
+            ) from error
+
+
+def check_agent(
+    agent: Agent,
+    *,
+    obs: Obs | Sequence[Obs] | None = None,
+    instructions: Sequence[str] = ("pick up the cube", "push the cube", "open the drawer"),
+    reset_kwargs: Mapping[str, Any] | None = None,
+    steps: int = 3,
+    atol: float = 1e-5,
+) -> None:
+    """Check that an agent implements the interface of `Agent`; initializes and closes it.
+
+    Three sessions, copies of the initialized agent, run with an observation, an instruction and a seed each: first in
+    sequence, then interleaved, with prepared observations, then in batches of 1, 2 and 3. Their actions must not depend
+    on the other sessions, nor on whether `prepare` was called. If the agent defines `prepare`, several threads call it
+    while sessions are reset and acted on, as in a server, and every result must equal that of a single thread.
+
+    Args:
+        agent: The agent, not initialized yet.
+        obs: The observations of the sessions, in turn; by default random values that fit the contract.
+        instructions: The instructions of the sessions, in turn; pass valid ones if the policy parses them.
+        reset_kwargs: Further arguments of each `reset`, beside `seed`.
+        steps: The number of calls of `act` in a session.
+        atol: The largest difference between an action in a batch and the same action of a single session.
+
+    Raises:
+        ContractViolation: The agent does not implement the interface; the message names the place.
+    """
+    agent.initialize()
+    contract = agent.contract
+    if contract is not None and not isinstance(contract, Contract):
+        raise ContractViolation(f"contract: got {type(contract).__name__}, want a Contract or None")
+    views = (
+        [obs]
+        if isinstance(obs, Obs)
+        else list(obs or [random_observation(contract, seed) for seed in range(_SESSIONS)])
+    )
+    suite = _AgentSuite(agent, contract, views, instructions, dict(reset_kwargs or {}))
+
+    alone = [suite.play_alone(i, steps) for i in range(_SESSIONS)]
+    because = "the same observations, instruction and seed must give the same actions"
+    for i, again in enumerate([suite.play_alone(i, steps) for i in range(_SESSIONS)]):
+        require_same(alone[i], again, f"act of session {i}", because)
+    because = "it depends on other sessions: keep what belongs to an episode in self, and out of `shared`"
+    sessions = [suite.begin(i) for i in range(_SESSIONS)]
+    for step in range(steps):
+        for i, session in enumerate(sessions):
+            require_same(alone[i][step], suite.act(i, session), f"act {step} of session {i}", because)
+    if type(agent).prepare is not Agent.prepare:
+        because = "`prepare` must compute what `act` computes without it"
+        for i, session in enumerate([suite.begin(i) for i in range(_SESSIONS)]):
+            for step in range(steps):
+                where = f"act {step} of session {i} on a prepared observation"
+                require_same(alone[i][step], suite.act(i, session, prepared=True), where, because)
+        _check_threads(suite, [acts[0] for acts in alone])
+    because = "act_batch must give each session what act gives it alone"
+    for size in range(1, _SESSIONS + 1):
+        batch = [suite.begin(i) for i in range(size)]
+        for step in range(steps):
+            for i, act in enumerate(suite.act_batch(batch)):
+                where = f"act {step} of session {i} in a batch of {size}"
+                require_same(alone[i][step], act, where, because, atol)
+    check_close(agent)
+
+
+def _check_threads(suite: _AgentSuite, first: list[Act]) -> None:
+    """Check that threads can prepare observations while sessions, with the acts `first`, are reset and acted on."""
+    sessions = [suite.begin(i) for i in range(_SESSIONS)]
+    serial = [suite.prepare(i, session) for i, session in enumerate(sessions)]
+    ended = threading.Event()
+    cure = suite.cure = (
+        "a server calls `prepare` on several threads, also while others are reset and acted on: change nothing in it "
+        "that sessions share, such as a tokenizer's padding; compute tokens in `reset`, or hold a lock"
+    )
+
+    def prepare(number: int) -> None:
+        while not ended.is_set():
+            i = number % _SESSIONS
+            require_same(serial[i], suite.prepare(i, sessions[i]), f"prepare of session {i} on a thread", cure)
+
+    with ThreadPoolExecutor(_THREADS) as threads:
+        running = [threads.submit(prepare, number) for number in range(_THREADS)]
+        usual = sys.getswitchinterval()
+        sys.setswitchinterval(_SWITCH_S)
+        try:
+            begun = time.monotonic()
+            for number in range(_ROUNDS):
+                if number >= _SESSIONS and time.monotonic() - begun > _LONGEST_S:
+                    break
+                i = number % _SESSIONS
+                *_, session = (suite.begin(i) for _ in range(_RESETS))
+                found = suite.act(i, session, prepared=number % 2 == 0)
+                require_same(first[i], found, f"act of session {i} while threads prepare", cure)
+        finally:
+            sys.setswitchinterval(usual)
+            ended.set()
+    for one in running:
+        one.result()
+
+
+@dataclass(slots=True)
+class _AgentSuite:
+    """Begins sessions and calls them, and checks their arguments and results."""
+
+    _agent: Agent
+    _contract: Contract | None
+    _views: list[Obs]
+    _instructions: Sequence[str]
+    _reset_kwargs: dict[str, Any]
+    cure: str = (  # of errors that the agent raises
+        "if the policy parses its instructions or takes only some observations, give "
+        "check_agent(…, instructions=[…], obs=[…]) those that it knows"
+    )
+
+    def begin(self, i: int) -> Agent:
+        """Begin session `i`: copy the agent except for its shared objects, and reset the copy."""
+        shared = {id(value): value for value in self._agent.shared_objects() if value is not None}
+        try:
+            session = copy.deepcopy(self._agent, dict(shared))
+        except (TypeError, AttributeError, NotImplementedError, RuntimeError) as error:
+            raise ContractViolation(
+                f"the initialized agent cannot be copied for a session: {error}; "
+                f"name the attributes that sessions may share in `shared`"
+            ) from error
+        obs = self._view(i)
+        before = copy.deepcopy(obs)
+        with self._calling("reset", i):
+            info = session.reset(obs, self._instruction(i), seed=i, **self._reset_kwargs)
+        require_same(before, obs, "the observation", "reset changed the caller's: work on a copy")
+        if not isinstance(info, dict):
+            raise ContractViolation(f"reset: got {type(info).__name__}, want a dict")
+        require_wireable(info, "reset: info")
+        return session
+
+    def play_alone(self, i: int, steps: int) -> list[Act]:
+        session, given, kept = self.begin(i), list[Act](), list[Act]()
+        for _ in range(steps):
+            given.append(self.act(i, session))
+            kept.append(copy.deepcopy(given[-1]))
+        require_same(kept, given, "an earlier act", "a later one changed it: give a new array each time")
+        return kept
+
+    def act(self, i: int, session: Agent, *, prepared: bool = False) -> Act:
+        obs = self._view(i)
+        before = copy.deepcopy(obs)
+        if prepared:
+            obs = replace(obs, prepared=self.prepare(i, session))
+        with self._calling("act", i):
+            act = session.act(obs)
+        require_same(before, obs, "the observation", "act changed the caller's: work on a copy")
+        return self._checked(act, "act")
+
+    def prepare(self, i: int, session: Agent) -> Any:
+        with self._calling("prepare", i):
+            return session.prepare(self._view(i))
+
+    def act_batch(self, sessions: list[Agent]) -> list[Act]:
+        views = [self._view(i) for i in range(len(sessions))]
+        before = copy.deepcopy(views)
+        acts = self._agent.act_batch(views, sessions)
+        require_same(before, views, "the observations", "act_batch changed the caller's: work on copies")
+        if not isinstance(acts, list) or len(acts) != len(sessions):
+            got = f"{len(acts)} of them" if isinstance(acts, list) else type(acts).__name__
+            raise ContractViolation(f"act_batch: got {got}, want a list of {len(sessions)} acts")
+        return [self._checked(act, "act_batch") for act in acts]
+
+    @contextmanager
+    def _calling(self, method: str, i: int) -> Iterator[None]:
+        try:
+            yield
+        except Exception as error:
+            got = f"{method}: raised {error!r} for the instruction {self._instruction(i)!r}"
+            if method != "reset":
+                got += f" and the observation of session {i}"
+            raise ContractViolation(f"{got}, want no error; {self.cure}") from error
+
+    def _instruction(self, i: int) -> str:
+        return self._instructions[i % len(self._instructions)]
+
+    def _view(self, i: int) -> Obs:
+        return self._views[i % len(self._views)]
+
+    def _checked(self, act: object, where: str) -> Act:
+        if isinstance(act, Exception):
+            raise ContractViolation(f"{where}: failed with {act!r} for an observation that `act` takes") from act
+        if not isinstance(act, Act):
+            raise ContractViolation(f"{where}: got {type(act).__name__}, want an Act")
+        if not isinstance(act.action, np.ndarray) or act.action.dtype != np.float32:
+            got = act.action.dtype if isinstance(act.action, np.ndarray) else type(act.action).__name__
+            raise ContractViolation(f"{where}: the action is {got}, want a numpy array of float32")
+        try:
+            check_action(act.action, self._contract)
+        except InvalidAction as error:
+            raise ContractViolation(f"{where}: {error}") from error
+        chunk = self._contract.chunk if self._contract is not None else None
+        if chunk not in (None, len(act.rows())):
+            raise ContractViolation(f"{where}: the action has {len(act.rows())} rows, the contract states {chunk}")
+        if type(act.done) is not bool:
+            raise ContractViolation(f"{where}: done is {type(act.done).__name__}, want a bool")
+        require_wireable(act.info, f"{where}: info")
+        return act
+
+
+def random_observation(
+    contract: Contract | None, seed: int, *, side: int = _SIDE, dims: Mapping[str, int] | None = None
+) -> Obs:
+    """Make a random observation that fits a contract; equal seeds give equal observations.
+
+    Args:
+        contract: The contract; None for one camera and one state.
+        seed: The seed.
+        side: Height and width of images whose size the contract does not state, pixels.
+        dims: Sizes of parts of the state that the contract does not state.
+    """
+    rng = np.random.default_rng(seed)
+    cameras: Mapping[str, CameraSpec] = {"front": CameraSpec()}
+    state: Mapping[str, StateSpec] = {"joints": StateSpec()}
+    if contract is not None:
+        cameras = cameras if contract.cameras is None else contract.cameras
+        state = state if contract.state is None else contract.state
+    sizes = {name: part.dim or (dims or {}).get(name, _DIM) for name, part in state.items()}
+    return Obs(
+        cameras={
+            name: rng.integers(0, 256, (camera.height or side, camera.width or side, 3), dtype=np.uint8)
+            for name, camera in cameras.items()
+        },
+        gripper=float(rng.uniform()),
+        state={name: rng.uniform(-1, 1, size).astype(np.float32) for name, size in sizes.items()},
+    )
+
+
+def check_env(
+    env: EvalEnv,
+    *,
+    steps: int = 5,
+    seeds: tuple[int, int] = (0, 1),
+    options: Mapping[str, Any] | None = None,
+    same_steps: bool = True,
+    step_limit: bool = True,
+) -> None:
+    """Check that an environment implements the interface of `EvalEnv`; closes it.
+
+    Random actions are executed in an episode of each of the two seeds, and then in the first episode again.
+
+    Args:
+        env: The environment, not reset yet.
+        steps: The number of actions in an episode.
+        seeds: The seeds of two different episodes.
+        options: The options of each `reset`.
+        same_steps: Whether the same actions must also lead to the same observations; if False, only the first
+            observation of a seed must be the same, as for a simulator that is not reproducible bit for bit.
+        step_limit: Whether one episode runs until `env.max_steps`; False if that takes too long.
+
+    Raises:
+        ContractViolation: The environment does not implement the interface; the message names the place.
+    """
+    contract = env.contract
+    if not isinstance(contract, Contract):
+        raise ContractViolation(f"contract: got {type(contract).__name__}, want a Contract")
+    if contract.action.dim is None:
+        raise ContractViolation("contract.action.dim: got None, want the number of components of an action")
+    if type(env.max_steps) is not int or env.max_steps < 1:
+        raise ContractViolation(f"max_steps: got {env.max_steps!r}, want an int of at least 1")
+    require_wireable(env.describe(), "describe()")
+    if not all(isinstance(name, str) for name in env.tasks()):
+        raise ContractViolation(f"tasks(): got {env.tasks()!r}, want a list of names")
+    suite = _EnvSuite(env, contract, options)
+    actions = suite.random_actions(steps)
+    first = suite.play(seeds[0], actions)
+    other = suite.play(seeds[1], actions)
+    again = suite.play(seeds[0], actions)
+    because = "an episode must be a pure function of its seed and options, whatever was played before"
+    require_same(first.instruction, again.instruction, "instruction", because)
+    require_same(first.seen[0], again.seen[0], "the first observation", because)
+    if same_steps:
+        for i, (a, b) in enumerate(zip(first.seen, again.seen, strict=False)):
+            require_same(a, b, f"the observation after step {i}", because)
+        require_same(first.outcomes, again.outcomes, "[reward, terminated, truncated, success] of the steps", because)
+        suite.check_unseen(seeds[0], actions, first)
+    because = "a later step or reset changed it: give new arrays each time"
+    for rollout in (first, other, again):
+        for i, (given, kept) in enumerate(zip(rollout.given, rollout.seen, strict=True)):
+            require_same(kept, given, f"the observation after step {i}", because)
+    suite.check_invalid_actions(seeds[0])
+    if step_limit:
+        suite.check_step_limit(seeds[0])
+    check_close(env)
+
+
+@dataclass(slots=True)
+class _Rollout:
+    instruction: str
+    given: list[Obs]  # the env's own objects
+    seen: list[Obs]  # copies of them, made immediately
+    outcomes: list[Any]
+
+
+@dataclass(slots=True)
+class _EnvSuite:
+    """Plays episodes, and checks the results of the environment."""
+
+    _env: EvalEnv
+    _contract: Contract
+    _options: Mapping[str, Any] | None
+
+    def random_actions(self, count: int) -> list[np.ndarray]:
+        spec = self._contract.action
+        low = -1.0 if spec.low is None else spec.low
+        high = 1.0 if spec.high is None else spec.high
+        return list(np.random.default_rng(0).uniform(low, high, (count, spec.dim or 1)).astype(np.float32))
+
+    def play(self, seed: int, actions: list[np.ndarray]) -> _Rollout:
+        obs = self.reset(seed)
+        rollout = _Rollout(self._env.instruction, [obs], [copy.deepcopy(obs)], [])
+        for action in actions:
+            obs, outcome = self.step(action)
+            rollout.given.append(obs)
+            rollout.seen.append(copy.deepcopy(obs))
+            rollout.outcomes.append(outcome)
+            if outcome[1] or outcome[2]:
+                break
+        return rollout
+
+    def reset(self, seed: int) -> Obs:
+        result = self._env.reset(seed=seed, options=self._options)
+        if not isinstance(result, tuple) or len(result) != 2:
+            raise ContractViolation(f"reset: got {kind_of(result)}, want (Obs, info)")
+        obs, info = result
+        _check_obs(obs, self._contract, "reset")
+        if not isinstance(info, dict):
+            raise ContractViolation(f"reset: info is {kind_of(info)}, want a dict")
+        require_wireable(info, "reset: info")
+        instruction = self._env.instruction
+        if not isinstance(instruction, str):
+            raise ContractViolation(f"instruction: got {kind_of(instruction)}, want a str")
+        if self._contract.instruction and not instruction:
+            raise ContractViolation("instruction: is empty, but the contract states that the env has one")
+        return obs
+
+    def step(self, action: np.ndarray) -> tuple[Obs, list[Any]]:
+        """Execute an action; return the observation, and reward, terminated, truncated and success."""
+        sent = action.copy()
+        result = self._env.step(Act(sent))
+        require_same(action, sent, "the action", "step must leave the caller's array as it is")
+        if not isinstance(result, tuple) or len(result) != 5:
+            raise ContractViolation(f"step: got {kind_of(result)}, want (Obs, reward, terminated, truncated, info)")
+        obs, *outcome, info = result
+        _check_obs(obs, self._contract, "step")
+        kinds = (("reward", float), ("terminated", bool), ("truncated", bool))
+        for (name, kind), value in zip(kinds, outcome, strict=True):
+            if type(value) is not kind:
+                raise ContractViolation(f"step: {name} is {kind_of(value)}, want a {kind.__name__}")
+        if not isinstance(info, dict):
+            raise ContractViolation(f"step: info is {kind_of(info)}, want a dict")
+        if type(info.get("success")) is not bool:
+            raise ContractViolation(f"step: info['success'] is {kind_of(info.get('success'))}, want a bool")
+        require_wireable(info, "step: info")
+        return obs, [*outcome, info["success"]]
+
+    def check_unseen(self, seed: int, actions: list[np.ndarray], seen: _Rollout) -> None:
+        """Repeat the episode `seen` with `looked_at` False before the last step; only images may be absent."""
+        self.reset(seed)
+        last = len(seen.outcomes) - 1
+        because = "`looked_at` may omit images and must change nothing else"
+        for i, (action, expected) in enumerate(zip(actions, seen.seen[1:], strict=False)):
+            self._env.looked_at = i == last
+            obs, reward, terminated, truncated, info = self._env.step(Act(action.copy()))
+            a, b = (one if i == last else Obs({}, one.gripper, one.state) for one in (expected, obs))
+            require_same(a, b, f"the observation after step {i}", because)
+            outcome = [reward, terminated, truncated, info["success"]]
+            require_same(seen.outcomes[i], outcome, f"[reward, terminated, truncated, success] of step {i}", because)
+
+    def check_invalid_actions(self, seed: int) -> None:
+        self.reset(seed)
+        [good] = self.random_actions(1)
+        dim = len(good)
+        for what, action in (
+            (f"of shape ({dim + 1},)", np.append(good, good[0])),
+            ("that holds NaN", np.full(dim, np.nan, np.float32)),
+        ):
+            try:
+                self._env.step(Act(action))
+            except InvalidAction:
+                continue
+            except Exception as error:
+                raise ContractViolation(f"step: an action {what} raised {error!r}, want InvalidAction") from error
+            raise ContractViolation(f"step: an action {what} was executed, want InvalidAction")
+        self.step(good)
+
+    def check_step_limit(self, seed: int) -> None:
+        self.reset(seed)
+        [action] = self.random_actions(1)
+        limit = self._env.max_steps
+        for count in range(1, limit + 1):
+            _, (_, terminated, truncated, _) = self.step(action)
+            if terminated:
+                return
+            if truncated != (count == limit):
+                state = "is" if truncated else "is not"
+                raise ContractViolation(f"step {count} {state} truncated, but max_steps is {limit}")
+
+
+def _check_obs(obs: object, contract: Contract, where: str) -> None:
+    if not isinstance(obs, Obs):
+        raise ContractViolation(f"{where}: the observation is {kind_of(obs)}, want an Obs")
+    try:
+        check_observation(obs, contract)
+    except InvalidObservation as error:
+        raise ContractViolation(f"{where}: {error}") from error
+    for name, part in obs.state.items():
+        if part.dtype != np.float32:
+            raise ContractViolation(f"{where}: state {name!r} is {part.dtype}, want float32")
+    for kind, have, stated in (("cameras", obs.cameras, contract.cameras), ("state", obs.state, contract.state)):
+        if stated is not None and set(have) != set(stated):
+            raise ContractViolation(f"{where}: {kind} are {sorted(have)}, the contract states {sorted(stated)}")
+    if contract.gripper is False and obs.gripper is not None:
+        raise ContractViolation(f"{where}: gripper is {obs.gripper}, the contract states that there is none")
+    require_wireable(obs.info, f"{where}: Obs.info")
