@@ -61,7 +61,8 @@ def measure_growth(plan: GrowthPlan, progress: Callable[[str], None] = lambda _:
 
     The curve of replicas has as many sessions as there are robots.
     """
-    limit, rate = max(plan.robots, *plan.sessions), plan.acts_per_s
+    rate = plan.acts_per_s
+    limit = 2 * max(plan.robots, *plan.sessions)  # those of the measurement before may still be ending
     found: dict[str, Any] = {"plan": asdict(plan), "sessions": [], "replicas": []}
     for replicas in sorted({1, *plan.replicas}):
         with running_server(deployment(POLICY, replicas=replicas, sessions={"limit": limit})) as server:
