@@ -7,6 +7,7 @@ than five rows; `batch_wait_timeout_s` is Ray's default, 10 ms.
 
 from __future__ import annotations
 
+import os
 import threading
 import time
 from typing import Any
@@ -14,6 +15,9 @@ from typing import Any
 import msgpack
 import numpy as np
 import peer
+
+os.environ.setdefault("RAY_AUTH_MODE", "token")  # Ray's default where it starts a cluster, but not where it joins one
+
 import ray
 import requests
 from ray import serve as ray_serve
