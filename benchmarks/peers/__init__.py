@@ -23,6 +23,7 @@ from typing import Annotated, Any
 import typer
 
 from benchmarks.drivers import START_S, ClientProcess, ProcessDriver
+from benchmarks.processes import descendants
 from benchmarks.round_trips import LOOPBACK, StartClient
 from vlagents_ray.bench.line_process import LineProcess
 from vlagents_ray.errors import ConfigError
@@ -162,9 +163,17 @@ class PeerServer:
             self.signal(signal.SIGSTOP)
 
     def signal(self, number: signal.Signals) -> None:
-        """Send a signal to the processes of a server that polls."""
-        if self.polls and self.process is not None:
-            os.killpg(self.process.pid, number)
+        """Send a signal to the processes of a server that polls.
+
+        It is not sent to the helper of `multiprocessing`, which waits for the end of a pipe: stopped, it would never
+        see that end, and outlive a killed benchmark.
+        """
+        if not self.polls or self.process is None:
+            return
+        for pid in (self.process.pid, *descendants(self.process.pid)):
+            with contextlib.suppress(OSError):  # it has ended
+                if b"resource_tracker" not in Path(f"/proc/{pid}/cmdline").read_bytes():
+                    os.kill(pid, number)
 
 
 class _PeerDriver(ClientProcess):

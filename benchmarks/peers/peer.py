@@ -104,12 +104,13 @@ class Client:
     before: Callable[[int, float], None] = lambda _clients, _end: None  # each run: number of clients, and its end
 
 
-def end_with_stdin() -> None:
-    """End this process, a server, as soon as its standard input ends."""
+def end_with_stdin(end: Callable[[], None] = lambda: None) -> None:
+    """End this process, a server, as soon as its standard input ends; before that, call `end`."""
 
     def wait() -> None:
         while os.read(0, 4096):
             pass
+        end()
         os._exit(0)
 
     threading.Thread(target=wait, daemon=True).start()
@@ -142,19 +143,22 @@ def run(
     serve: Callable[[str, int, Policy], None] | None,
     connect: Callable[[Target], Client],
     evaluate: Callable[[str, int, dict[str, Any]], None] | None = None,
+    *,
+    end: Callable[[], None] = lambda: None,
 ) -> None:
     """Run the command of a script.
 
     Its commands are `serve HOST PORT POLICY`; `drive HOST PORT OBS.npz MODE POLICY`, a client that makes calls in its
     turn; `load … ROBOTS SIMULATIONS`, with the same words before, clients that make load; `evaluate HOST PORT PLAN`,
     which writes a line when all its episodes are played and all its processes have ended. POLICY and PLAN are JSON.
-    Without `serve`, the clients' process starts its server.
+    Without `serve`, the clients' process starts its server. `end` ends what the server's process has started, if that
+    does not end with it.
     """
     die_with_parent()
     out = own_stdout()
     command, host, port = sys.argv[1], sys.argv[2], int(sys.argv[3])
     if command == "serve" and serve is not None:
-        end_with_stdin()
+        end_with_stdin(end)
         serve(host, port, Policy(**json.loads(sys.argv[4])))
     elif command == "evaluate" and evaluate is not None:
         end_with_stdin()

@@ -85,4 +85,4 @@ def connect(target: peer.Target) -> peer.Client:
 
 
 if __name__ == "__main__":
-    peer.run(serve, connect)
+    peer.run(serve, connect, end=ray.shutdown)

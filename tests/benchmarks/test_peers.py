@@ -26,6 +26,7 @@ from benchmarks.peers import (
     peer_connected,
     serving,
 )
+from benchmarks.processes import descendants
 from benchmarks.throughput import ThroughputPlan, peer_fleet
 from vlagents_ray.bench.line_process import ProcessFailed
 from vlagents_ray.errors import ConfigError
@@ -120,6 +121,55 @@ def test_a_killed_bench_takes_its_processes_along(fake: PeerClient, obs: Path, c
         wait_for(lambda: b"fake_peer" in Path(f"/proc/{pid}/cmdline").read_bytes())
         bench.send_signal(signal.SIGKILL)
     wait_for(lambda: gone(pid))
+
+
+POLLING = """
+import multiprocessing
+
+peer.die_with_parent()  # as in processes that a script in the folder of the peers spawns
+
+def child(up):
+    up.set()
+    multiprocessing.Event().wait()
+
+def serve(host, port, policy):
+    spawn = multiprocessing.get_context("spawn")
+    up = spawn.Event()
+    spawn.Process(target=child, args=(up,), daemon=True).start()
+    up.wait()
+    with socket.create_server((host, port)) as server:
+        multiprocessing.Event().wait()
+
+if __name__ == "__main__":
+    peer.run(serve, connect)
+"""
+KILLED = """
+import sys, time
+from pathlib import Path
+from benchmarks.peers import PeerClient, peer_connected
+
+one = PeerClient("fake", "fake", sys.argv[1], "raw", (), polls=True)
+with peer_connected(one, Path(sys.executable), Path(sys.argv[2]), {}) as driver:
+    driver.ready()
+    print("stopped", flush=True)
+    time.sleep(60)
+"""
+
+
+def test_a_killed_bench_takes_the_processes_of_a_server_along_that_it_has_stopped(tmp_path: Path, obs: Path) -> None:
+    script = tmp_path / "polling_peer.py"
+    script.write_text(FAKE.removesuffix("peer.run(serve, connect)\n") + POLLING)
+    with subprocess.Popen(
+        [PYTHON, "-c", KILLED, str(script), str(obs)], stdout=subprocess.PIPE, text=True, cwd=SCRIPTS.parents[1]
+    ) as bench:
+        assert bench.stdout is not None
+        assert bench.stdout.readline() == "stopped\n"
+        pids = descendants(bench.pid)
+        stopped = [pid for pid in pids if state(pid) == "T"]
+        bench.send_signal(signal.SIGKILL)
+    assert len(stopped) == 2  # the server, and the process that it has spawned
+    assert len(pids) == 4  # also the client, and the helper of multiprocessing
+    wait_for(lambda: all(gone(pid) for pid in pids), 10.0)
 
 
 def state(pid: int) -> str:
