@@ -19,7 +19,8 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from benchmarks.environments import ACTION_DIM, SLEEPING_ENV
-from benchmarks.overhead import cpu_seconds, recorded, steady
+from benchmarks.overhead import recorded, steady
+from benchmarks.processes import cpu_seconds, program
 from vlagents_ray.bench.line_client import die_with_parent, own_stdout
 from vlagents_ray.evaluate import EvalConfig, PolicyConfig, Progress, SuiteConfig, WorkerConfig, evaluate
 from vlagents_ray.evaluate.episode.records import EpisodeResult
@@ -28,7 +29,7 @@ from vlagents_ray.policies.noop import Noop, NoopConfig
 from vlagents_ray.serve.launch.deployment_file import deployment, together
 from vlagents_ray.serve.launch.server import running_server
 
-DAEMONS = ("gcs_server", "raylet", "ServeController")  # of this node, by words of their command line
+DAEMONS = ("gcs_server", "raylet", "ServeController")  # of this node
 
 
 @dataclass(frozen=True, slots=True)
@@ -134,14 +135,10 @@ def play(one: ScalingRound, out: Path) -> PlayedEpisodes:
 def daemons_s() -> dict[str, float]:
     """Return the CPU time that Ray's own processes of this node have used so far, s."""
     found = dict.fromkeys(DAEMONS, 0.0)
-    for entry in Path("/proc").iterdir():
-        if not entry.name.isdigit():
-            continue
+    for entry in Path("/proc").glob("[0-9]*"):
         with contextlib.suppress(OSError):  # it has ended
-            program = (entry / "cmdline").read_bytes().partition(b"\0")[0].decode(errors="replace")
-            for name in DAEMONS:
-                if Path(program).name.removeprefix("ray::").startswith(name):
-                    found[name] += cpu_seconds(int(entry.name))
+            if (name := program(pid := int(entry.name))) in found:
+                found[name] += cpu_seconds(pid)
     return found
 
 

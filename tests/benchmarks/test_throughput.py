@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import math
+import time
 from pathlib import Path
 
 import pytest
 
 from benchmarks.autoscaling import AutoscalingPlan, LoadPhase, ScaleSample, by_second, plot_autoscaling, report
 from benchmarks.bare_policy import BarePolicy
+from benchmarks.closed_loop import ClosedLoop
+from benchmarks.figures import mean_interval
 from benchmarks.push import measure_push
 from benchmarks.rollouts import main
 from benchmarks.throughput import ThroughputPlan
@@ -38,6 +41,31 @@ def test_the_rate_of_batches_does_not_depend_on_where_the_time_begins(cut: float
 def test_too_few_calls_have_no_rate() -> None:
     assert rate_of([]) == 0
     assert rate_of([[(1.0, 1.0, 1.0, 1)]]) == 0
+
+
+def test_robots_think_and_a_late_answer_ends_a_client() -> None:
+    def prompt() -> tuple[float, float, int]:
+        time.sleep(0.001)
+        return 3.0, 1.0, 4
+
+    def late() -> tuple[float, float, int]:
+        time.sleep(0.3)
+        raise TimeoutError
+
+    loop = ClosedLoop([prompt, prompt, late], robots=1)
+    begin = time.monotonic()
+    robot, simulation, ended = loop.run(1, 2, begin, begin + 0.2)
+    assert 0 < len(robot) < len(simulation)
+    assert {call[1:] for call in simulation} == {(3.0, 1.0, 4)}
+    assert ended == []
+    with pytest.raises(TimeoutError):
+        loop.run(0, 2, begin, time.monotonic() + 1)
+    loop.close()
+
+
+def test_the_interval_of_a_mean_is_students() -> None:
+    assert mean_interval([1.0]) is None
+    assert mean_interval([9.0, 10.0, 11.0]) == pytest.approx((10 - 4.303 / 3**0.5, 10 + 4.303 / 3**0.5))
 
 
 def test_a_bare_policy_is_run_in_full_batches() -> None:
