@@ -3,92 +3,162 @@
 from __future__ import annotations
 
 import contextlib
-import math
 import os
 import re
-from collections.abc import Iterator
-from functools import cache
-from typing import TYPE_CHECKING, Any
+from collections.abc import Callable, Iterator, Mapping
+from functools import cache, partial
+from math import ceil
+from typing import Any
 
+from vlagents_ray.cli.console import out
 from vlagents_ray.cli.listing import require_packages
 from vlagents_ray.cli.options import YAML_SUFFIXES
-from vlagents_ray.cli.ray_session import quiet_ray
+from vlagents_ray.cli.ray_session import RESUME, exit_if_ray_is_lost, quiet_ray
 from vlagents_ray.client.agent import RemoteAgent
 from vlagents_ray.contract import require_match
 from vlagents_ray.envs.base import known_contract
 from vlagents_ray.errors import ConfigError, ContractMismatch
-from vlagents_ray.evaluate import EvalConfig, PolicyConfig, check, most_cpus, most_gpus
+from vlagents_ray.evaluate import EvalConfig, PolicyConfig, check
 from vlagents_ray.evaluate.plan.cases import cells
+from vlagents_ray.evaluate.workers.in_process import chosen_workers
+from vlagents_ray.evaluate.workers.rollout import THREAD_VARIABLES
+from vlagents_ray.interface import Agent
+from vlagents_ray.policies.base.accelerator import VISIBLE
 from vlagents_ray.ray_tools.private import gpus_here
-from vlagents_ray.ray_tools.session import joined
+from vlagents_ray.ray_tools.session import joined, variables
+from vlagents_ray.serve.config.deployment import ServerArgs
 from vlagents_ray.serve.launch.deployment_file import (
+    IMPORT_PATH,
+    PlainDeployment,
+    only_application,
     own_settings,
-    read_deployment,
+    read_policy,
     stated_contract,
     together,
     with_settings,
 )
-from vlagents_ray.serve.launch.server import running_server, spread_over_gpus
+from vlagents_ray.serve.local_agent import LocalPolicy
 from vlagents_ray.serve.models.checkpoints import STEP, resolved
 
-if TYPE_CHECKING:
-    from ray.serve.schema import ServeDeploySchema
-
+Agents = Mapping[str, Callable[[], Agent]]  # of policies that are played in this process, by name
 _STARTING_S = 30.0  # time limit for a server at a URL
 
 
 @contextlib.contextmanager
-def served(config: EvalConfig, address: str | None = None, *, replica_per_gpu: bool = False) -> Iterator[EvalConfig]:
-    """Serve the policies that are not at a URL for the length of the context.
+def served(
+    config: EvalConfig, address: str | None = None, *, replica_per_gpu: bool = False
+) -> Iterator[tuple[EvalConfig, Agents]]:
+    """Serve the policies that are not at a URL for the length of the context, or let this process play them.
 
     Yields:
-        The evaluation with the URLs of all its policies.
+        The evaluation with its number of workers and the URLs of its policies; and, without workers, the agents of the
+        policies that are not at a URL.
     """
+    if config.workers == 0 and (address is not None or replica_per_gpu):
+        raise ConfigError("workers: got 0 with --address, want 1 or more in a cluster, or no --address")
     with contextlib.ExitStack() as stack:
-        stack.enter_context(quiet_ray(None))
-        if address is not None:
-            stack.enter_context(joined(address))
-        config, parts = resolve_policies(config)
-        # Raise errors before anything starts.
-        if address is None:
-            wanted = max(cell.worker.gpus for cell in cells(config))
-            if wanted and wanted > (here := gpus_here()):  # Ray would never start these workers here
-                raise ConfigError(
-                    f"worker.gpus: a worker wants {wanted:g} GPUs, this machine has {here:g}; want less (0 draws in "
-                    f"software), or the --address of a cluster that has them"
+        on_ray = address is not None or config.real_robot is not None or chosen_workers(config) > 0
+        if not on_ray:
+            resolved_config, parts = resolve_policies(config)
+            needs = [need for part in parts.values() if (need := _needs_ray(part, chosen=config.workers == 0))]
+            if needs and config.workers == 0:
+                raise ConfigError(f"workers: got 0, which plays without Ray, but {needs[0]}; want 1 or more")
+            on_ray = bool(needs)
+        if on_ray:
+            stack.enter_context(quiet_ray(None))
+            stack.enter_context(exit_if_ray_is_lost(RESUME))
+            if address is not None:
+                stack.enter_context(joined(address))
+            resolved_config, parts = resolve_policies(config)
+        _require_startable(resolved_config, parts, address)
+        if not on_ray:
+            if config.workers is None:
+                out.print(
+                    "a short evaluation, played in this process without Ray (--workers 1 starts Ray and a worker)"
                 )
-            for part in parts.values():
-                require_packages(part)
-        policy_contract = cache(lambda application: stated_contract(parts[application]))
-        for cell in cells(config) if config.real_robot is None else ():
-            application = str(cell.policy.url).removeprefix("serve://")
-            if application in parts and (env := known_contract(cell.env, cell.suite.env_options)) is not None:
-                try:
-                    require_match(policy_contract(application), env)
-                except ContractMismatch as error:
-                    raise ContractMismatch(f"{cell.policy.name!r} in {cell.env!r}: {error}") from None
-        check(config)
-        if parts and replica_per_gpu:
-            parts = spread_over_gpus(parts, kept=config.workers * most_gpus(config))
+            yield _in_process(stack, resolved_config, parts)
+            return
+        ready = resolved_config.model_copy(update={"workers": config.workers or 1})
         if parts:
+            from vlagents_ray.evaluate.workers.cluster import most_cpus, most_gpus
+            from vlagents_ray.serve.launch.server import running_server, spread_over_gpus
+
+            if replica_per_gpu:
+                parts = spread_over_gpus(parts, kept=(ready.workers or 1) * most_gpus(ready))
             # Ray's CPUs are logical here: the requested number of workers must fit.
-            cpus = max(os.cpu_count() or 1, math.ceil(config.workers * most_cpus(config)))
+            cpus = max(os.cpu_count() or 1, ceil((ready.workers or 1) * most_cpus(ready)))
             stack.enter_context(running_server(together(parts), address=address, num_cpus=cpus, ingress=False))
-        yield config
+        yield ready, {}
 
 
-def resolve_policies(config: EvalConfig, *, ask: bool = True) -> tuple[EvalConfig, dict[str, ServeDeploySchema]]:
+def _needs_ray(part: PlainDeployment, *, chosen: bool) -> str | None:
+    """Return why a policy needs Ray, as a clause; None if this process can play it.
+
+    Unless the user has `chosen` this process, policies with a GPU or with a Python of their own, which load for long,
+    are also left to Ray.
+    """
+    app = part.applications[0]
+    if app.import_path != IMPORT_PATH or app.runtime_env:
+        return f"{app.name!r} has a runtime_env or another import_path than {IMPORT_PATH}"
+    args = ServerArgs(**app.args)
+    if not chosen and (args.resources.num_gpus or args.environment.python):
+        return f"{app.name!r} has a GPU or its own Python"
+    return None
+
+
+def _require_startable(config: EvalConfig, parts: Mapping[str, PlainDeployment], address: str | None) -> None:
+    """Raise the errors of an evaluation that can be found before anything starts."""
+    if address is None:
+        wanted = max(cell.worker.gpus for cell in cells(config))
+        if wanted and wanted > (here := gpus_here()):  # Ray would never start these workers here
+            raise ConfigError(
+                f"worker.gpus: a worker wants {wanted:g} GPUs, this machine has {here:g}; want less (0 draws in "
+                f"software), or the --address of a cluster that has them"
+            )
+        for part in parts.values():
+            require_packages(part)
+    policy_contract = cache(lambda application: stated_contract(parts[application]))
+    for cell in cells(config) if config.real_robot is None else ():
+        application = str(cell.policy.url).removeprefix("serve://")
+        if application in parts and (env := known_contract(cell.env, cell.suite.env_options)) is not None:
+            try:
+                require_match(policy_contract(application), env)
+            except ContractMismatch as error:
+                raise ContractMismatch(f"{cell.policy.name!r} in {cell.env!r}: {error}") from None
+    check(config)
+
+
+def _in_process(
+    stack: contextlib.ExitStack, config: EvalConfig, parts: Mapping[str, PlainDeployment]
+) -> tuple[EvalConfig, Agents]:
+    """Return the evaluation without workers, and the agents of its policies that are not at a URL."""
+    policies, agents, gpus = [], {}, 0.0
+    for policy in config.policies:
+        if (part := parts.get(str(policy.url).removeprefix("serve://"))) is not None:
+            app = only_application(policy.name, part)
+            args = ServerArgs(**app.args)
+            gpus += args.resources.num_gpus
+            agents[policy.name] = partial(LocalPolicy, args, own_settings(app))
+            policy = policy.model_copy(update={"url": None})  # noqa: PLW2901 - the one that is played
+        policies.append(policy)
+    # As in workers and replicas, for the same results.
+    limits = dict.fromkeys(THREAD_VARIABLES, str(config.worker.threads)) | ({} if gpus else {VISIBLE: ""})
+    stack.enter_context(variables(limits))
+    return config.model_copy(update={"policies": policies, "workers": 0}), agents
+
+
+def resolve_policies(config: EvalConfig, *, ask: bool = True) -> tuple[EvalConfig, dict[str, PlainDeployment]]:
     """Find the names, URLs and deployments of the policies of an evaluation.
 
     Returns:
         The evaluation with names and URLs of its policies; and the deployments to start for it, by application.
     """
-    parts: dict[str, ServeDeploySchema] = {}
+    parts: dict[str, PlainDeployment] = {}
     policies = [_resolve_policy(policy, parts, ask=ask) for policy in config.policies]
     return type(config).model_validate(config.model_dump(exclude_unset=True) | {"policies": policies}), parts
 
 
-def _resolve_policy(policy: PolicyConfig, parts: dict[str, ServeDeploySchema], *, ask: bool) -> PolicyConfig:
+def _resolve_policy(policy: PolicyConfig, parts: dict[str, PlainDeployment], *, ask: bool) -> PolicyConfig:
     """Add name and URL to `policy`; add its deployment to `parts` unless a server has it."""
     url = policy.source if policy.source is not None and "://" in policy.source else policy.url
     if url is not None:
@@ -115,8 +185,8 @@ def _resolve_policy(policy: PolicyConfig, parts: dict[str, ServeDeploySchema], *
     return policy.model_copy(update=found)
 
 
-def policy_deployment(policy: PolicyConfig, source: str, *, step_follows: bool = False) -> ServeDeploySchema:
-    """Read the deployment of `source` with the settings of `policy`; `step_follows` as in `read_deployment`."""
+def policy_deployment(policy: PolicyConfig, source: str, *, step_follows: bool = False) -> PlainDeployment:
+    """Read the deployment of `source` with the settings of `policy`; `step_follows` as in `read_policy`."""
     of_name = {"config": policy.config} if policy.config and not source.endswith(YAML_SUFFIXES) else None
-    read = read_deployment(source, of_name, step_follows=step_follows)
+    read = read_policy(source, of_name, step_follows=step_follows)
     return with_settings(read, policy.config, steps=bool(policy.steps), step_follows=step_follows)

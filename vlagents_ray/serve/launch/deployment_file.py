@@ -5,38 +5,71 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import yaml
-from pydantic import ValidationError
-from ray.serve.schema import ServeApplicationSchema, ServeDeploySchema
+from pydantic import BaseModel, Field, ValidationError
 
 from vlagents_ray.contract import Contract
 from vlagents_ray.errors import ConfigError
 from vlagents_ray.policies.base.checkpoint import STEP as STEP_PLACE
-from vlagents_ray.policies.wrapper import build_agent
+from vlagents_ray.policies.wrapper import build_agent, unloaded_contract
 from vlagents_ray.ray_tools.runtime_env import require_no_secrets
 from vlagents_ray.registry import names, policy_class
 from vlagents_ray.serve.config.deployment import POLICY, ServerArgs
 from vlagents_ray.serve.models.checkpoints import CHOICE, STEP, Checkpoints
-from vlagents_ray.serve.python_env.child_main import unloaded_contract
 from vlagents_ray.serve.python_env.probe import check_policy, with_process
 from vlagents_ray.serve.requests import DEFAULT
 from vlagents_ray.settings import wrong_settings
+
+if TYPE_CHECKING:
+    from ray.serve.schema import ServeApplicationSchema, ServeDeploySchema
 
 IMPORT_PATH = "vlagents_ray.serve.app:build"
 DEFAULT_HOST, DEFAULT_PORT = "127.0.0.1", 8000
 
 
+class DeploymentSettings(BaseModel, extra="allow"):
+    """The settings of a deployment beside `args`, of an application."""
+
+    name: str
+    user_config: Any = None
+
+
+class PlainApplication(BaseModel, extra="allow"):
+    """An application, as in Serve's `ServeApplicationSchema`."""
+
+    name: str = "default"
+    route_prefix: str | None = "/"
+    import_path: str
+    args: dict[str, Any] = {}
+    runtime_env: dict[str, Any] = {}
+    deployments: list[DeploymentSettings] = []
+
+
+class PlainDeployment(BaseModel, extra="allow"):
+    """A deployment file as far as this package reads it, without importing Ray; `together` has Serve check the rest."""
+
+    applications: list[PlainApplication] = Field(min_length=1)
+
+
+Deployment = TypeVar("Deployment", "ServeDeploySchema", PlainDeployment)
+
+
 def deployment(policy: str, **args: Any) -> ServeDeploySchema:
     """Return the deployment of one policy, as if read from a file; `args` are those of `ServerArgs`."""
-    return _of_name(policy, args)
+    return _checked(_of_name(policy, args), f"policy {policy!r}", schema=_serve_schema())
 
 
-def read_deployment(
+def read_deployment(source: str, overrides: Mapping[str, Any] | None = None) -> ServeDeploySchema:
+    """Read and check a deployment as `read_policy` does, and the settings of Serve."""
+    return _read(source, overrides or {}, _serve_schema())
+
+
+def read_policy(
     source: str, overrides: Mapping[str, Any] | None = None, *, step_follows: bool = False
-) -> ServeDeploySchema:
-    """Read a deployment and check it.
+) -> PlainDeployment:
+    """Read a deployment and check it, apart from the settings of Serve.
 
     Args:
         source: A YAML file, or the name of a policy.
@@ -47,6 +80,18 @@ def read_deployment(
     Raises:
         ConfigError: The file or a setting is invalid.
     """
+    return _read(source, overrides or {}, PlainDeployment, step_follows=step_follows)
+
+
+def _serve_schema() -> type[ServeDeploySchema]:
+    from ray.serve.schema import ServeDeploySchema  # takes a second
+
+    return ServeDeploySchema
+
+
+def _read(
+    source: str, overrides: Mapping[str, Any], schema: type[Deployment], *, step_follows: bool = False
+) -> Deployment:
     path = Path(source)
     if path.suffix in (".yaml", ".yml"):
         if not path.is_file():
@@ -58,10 +103,10 @@ def read_deployment(
             document = yaml.safe_load(path.read_text())
         except yaml.YAMLError as error:
             raise ConfigError(f"{source}: not YAML ({error})") from error
-        return _checked(document, source, step_follows)
+        return _checked(document, source, schema, step_follows)
     if ":" not in source and source not in names("policies"):
         policy_class(source)  # raises an error with the list of choices
-    return _of_name(source, overrides or {}, step_follows)
+    return _checked(_of_name(source, overrides), f"policy {source!r}", schema, step_follows)
 
 
 def server_args(source: str, app: str | None = None) -> ServerArgs:
@@ -69,9 +114,9 @@ def server_args(source: str, app: str | None = None) -> ServerArgs:
     return ServerArgs(**policy_application(source, app).args)
 
 
-def policy_application(source: str, app: str | None = None) -> ServeApplicationSchema:
+def policy_application(source: str, app: str | None = None) -> PlainApplication:
     """Return one application of a deployment that serves a policy: the one named `app`, or the only one."""
-    ours: dict[str, ServeApplicationSchema] = {one.name: one for one in our_apps(read_deployment(source))}
+    ours: dict[str, PlainApplication] = {one.name: one for one in our_apps(read_policy(source))}
     if app is None and len(ours) == 1:
         [app] = ours
     if app not in ours:
@@ -100,7 +145,15 @@ def with_dialect(config: ServeDeploySchema, name: str, settings: Mapping[str, An
     return changed
 
 
-def together(policies: Mapping[str, ServeDeploySchema]) -> ServeDeploySchema:
+def only_application(name: str, part: ServeDeploySchema | PlainDeployment) -> Any:
+    """Return the application of a deployment for the policy `name`; raises `ConfigError` if it holds several."""
+    if len(part.applications) != 1:
+        found = [one.name for one in part.applications]
+        raise ConfigError(f"{name}: holds {found}, want one application; serve it and give the URL of one of them")
+    return part.applications[0]
+
+
+def together(policies: Mapping[str, ServeDeploySchema | PlainDeployment]) -> ServeDeploySchema:
     """Join several policies into one deployment, each as an application under its name, without dialects.
 
     Raises:
@@ -108,21 +161,18 @@ def together(policies: Mapping[str, ServeDeploySchema]) -> ServeDeploySchema:
     """
     applications = []
     for name, part in policies.items():
-        if len(part.applications) != 1:
-            found = [one.name for one in part.applications]
-            raise ConfigError(f"{name}: holds {found}, want one application; serve it and give the URL of one of them")
-        app = part.applications[0].model_dump(exclude_unset=True)
+        app = only_application(name, part).model_dump(exclude_unset=True)
         app.get("args", {}).pop("dialects", None)
         applications.append(app | {"name": name, "route_prefix": f"/{name}"})
-    return _checked({"applications": applications}, ", ".join(policies))
+    return _checked({"applications": applications}, ", ".join(policies), _serve_schema())
 
 
 def with_settings(
-    config: ServeDeploySchema, settings: Mapping[str, Any], *, steps: bool = False, step_follows: bool = False
-) -> ServeDeploySchema:
+    config: Deployment, settings: Mapping[str, Any], *, steps: bool = False, step_follows: bool = False
+) -> Deployment:
     """Return the deployment, with these settings of its policies in place of the file's.
 
-    With `steps`, sessions may choose any checkpoint step. See `read_deployment` for `step_follows`.
+    With `steps`, sessions may choose any checkpoint step. See `read_policy` for `step_follows`.
     """
     changed = config.model_copy(deep=True)
     for app in our_apps(changed):
@@ -130,10 +180,10 @@ def with_settings(
         app.deployments = [one for one in app.deployments if one.name != POLICY]
         if steps:
             app.args["checkpoints"] = (app.args.get("checkpoints") or {}) | {"steps": True}
-    return _checked(changed.model_dump(exclude_unset=True), "settings", step_follows)
+    return _checked(changed.model_dump(exclude_unset=True), "settings", type(config), step_follows)
 
 
-def with_replicas_on(config: ServeDeploySchema, gpus: float) -> ServeDeploySchema:
+def with_replicas_on(config: Deployment, gpus: float) -> Deployment:
     """Return the deployment with as many replicas as fit on `gpus`, each on one unless the file states another number.
 
     A policy is not changed if its file states the number of replicas, autoscaling, or zero GPUs.
@@ -154,13 +204,13 @@ def listens_at(config: ServeDeploySchema) -> tuple[str, int]:
     return http.host if "host" in stated else DEFAULT_HOST, http.port if "port" in stated else DEFAULT_PORT
 
 
-def own_settings(app: ServeApplicationSchema) -> dict[str, Any]:
+def own_settings(app: ServeApplicationSchema | PlainApplication) -> dict[str, Any]:
     """Return the policy's settings: `config`, and `user_config`, which may change while the policy runs."""
     beside = [one.user_config for one in app.deployments if one.name == POLICY and isinstance(one.user_config, dict)]
     return {**app.args.get("config", {}), **(beside[0] if beside else {})}
 
 
-def stated_contract(config: ServeDeploySchema) -> Contract | None:
+def stated_contract(config: PlainDeployment) -> Contract | None:
     """Return the contract of a deployment's policy, without loading the policy.
 
     Returns:
@@ -174,21 +224,21 @@ def stated_contract(config: ServeDeploySchema) -> Contract | None:
     return _contract(args, offered, offered.settings(DEFAULT, offered.config))
 
 
-def our_apps(config: ServeDeploySchema) -> list[Any]:
+def our_apps(config: ServeDeploySchema | PlainDeployment) -> list[Any]:
     """Return the applications of a deployment that serve a policy."""
     return [app for app in config.applications if app.import_path == IMPORT_PATH]
 
 
-def _of_name(policy: str, args: Mapping[str, Any], step_follows: bool = False) -> ServeDeploySchema:
+def _of_name(policy: str, args: Mapping[str, Any]) -> dict[str, Any]:
     name = policy.rpartition(":")[2]
     app = {"name": name, "route_prefix": "/", "import_path": IMPORT_PATH, "args": {"policy": policy, **args}}
-    return _checked({"applications": [app]}, f"policy {policy!r}", step_follows)
+    return {"applications": [app]}
 
 
-def _checked(document: object, source: str, step_follows: bool = False) -> ServeDeploySchema:
-    """Return the document as Serve's schema, with the `args` of this package checked before anything starts."""
+def _checked(document: object, source: str, schema: type[Deployment], step_follows: bool = False) -> Deployment:
+    """Return the document as that schema, with the `args` of this package checked before anything starts."""
     try:
-        config = ServeDeploySchema.model_validate(document)
+        config = schema.model_validate(document)
         for runtime_env in _runtime_envs(config):
             require_no_secrets(runtime_env)
         for app in our_apps(config):
@@ -201,12 +251,12 @@ def _checked(document: object, source: str, step_follows: bool = False) -> Serve
             installed = not (app.runtime_env or {})
             _require_policy(args, own_settings(app), installed=installed, step_follows=step_follows)
     except ValidationError as error:
-        model = ServerArgs if error.title == ServerArgs.__name__ else ServeDeploySchema
+        model = ServerArgs if error.title == ServerArgs.__name__ else schema
         raise ConfigError(f"{source}: {wrong_settings(error, model)}") from error
     return config
 
 
-def _runtime_envs(config: ServeDeploySchema) -> Iterator[Mapping[str, Any]]:
+def _runtime_envs(config: ServeDeploySchema | PlainDeployment) -> Iterator[Mapping[str, Any]]:
     """Yield the runtime environments of the applications and of their deployments."""
     for app in config.applications:
         yield app.runtime_env or {}
