@@ -42,7 +42,7 @@ from vlagents_ray.cli.console import errors, out, progress, table
 from vlagents_ray.cli.options import parse_list
 from vlagents_ray.errors import ConfigError
 from vlagents_ray.evaluate.results.summary import FILE as SUMMARY
-from vlagents_ray.evaluate.workers.cluster import THREAD_VARIABLES
+from vlagents_ray.evaluate.workers.rollout import THREAD_VARIABLES
 from vlagents_ray.serve.ports import LOOPBACK, free_block
 
 OURS = "vlagents-ray"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import functools
 import logging
 import os
@@ -15,9 +16,11 @@ from vlagents_ray.evaluate.plan.jobs import Job
 from vlagents_ray.evaluate.workers.base import WorkerHandle, Workers
 from vlagents_ray.evaluate.workers.rollout import AgentFactory, Report, Rollout
 from vlagents_ray.ray_tools.private import node_of_this_process
+from vlagents_ray.ray_tools.session import variables
 
 SHORT_STEPS = 10_000  # planned steps up to which Ray's start, some seconds, is a large part of the time
 _STEPS = 300  # of an episode, if the options of its environment name no `max_steps`
+_VARIABLES = "env_vars"  # in Ray's runtime environment
 log = logging.getLogger(__name__)
 
 
@@ -49,8 +52,8 @@ def ray_needed(config: EvalConfig) -> str | None:
             if url is not None and url.startswith("serve://"):
                 return f"{url} is a policy inside a Ray cluster"
     for cell in cells(config):
-        if cell.worker.runtime_env:
-            return f"the worker of {cell.env!r} has a runtime_env"
+        if more := sorted(cell.worker.runtime_env.keys() - {_VARIABLES}):
+            return f"the runtime_env of the worker of {cell.env!r} has {more}"
     return None
 
 
@@ -61,9 +64,11 @@ class InProcessWorkers(Workers):
         super().__init__()
         self._make = functools.partial(Rollout, config, agent_factory, recorders)
         self._rollout = self._make()
+        self._variables = contextlib.ExitStack()
 
     def __exit__(self, *_: object) -> None:
         self.close()
+        self._variables.close()
 
     def free_slot(self) -> bool:
         for worker in self.idle():
@@ -71,6 +76,7 @@ class InProcessWorkers(Workers):
         return not self._workers
 
     def start(self, cell: EvalCase) -> None:
+        self._variables.enter_context(variables(cell.worker.runtime_env.get(_VARIABLES) or {}))  # type: ignore[arg-type]
         self._workers.append(WorkerHandle(cell.worker, cell.kind, actor=None, starting=self, started_at=0.0))
 
     def dispatch(self, worker: WorkerHandle, jobs: tuple[Job, ...]) -> None:

@@ -377,6 +377,8 @@ class Engine:
         try:
             self._run(taken.batch)
         except BaseException as error:  # a policy that calls sys.exit() must not end the replica's only thread
+            if not self.threaded:  # Ctrl-C in the thread that called
+                raise
             logger.exception("the batch failed")
             for pending in taken.batch:
                 pending.fail(PolicyFailed(f"the policy raised {type(error).__name__}"))
