@@ -16,11 +16,13 @@ from typing import Any
 
 import pytest
 from eval_fakes import DRIFTING_LINE, LINE, OTHER_LINE, ToZero
+from in_process_evaluation import flat_config
 
 from vlagents_ray.errors import ClusterLost, ConfigError, EnvFailed
 from vlagents_ray.evaluate import EvalConfig, EvaluationInterrupted, Summary, evaluate, run
 from vlagents_ray.evaluate.episode.failures import Failure
 from vlagents_ray.evaluate.plan.jobs import Job
+from vlagents_ray.evaluate.workers import in_process
 from vlagents_ray.evaluate.workers.in_process import InProcessWorkers
 from vlagents_ray.evaluate.workers.rollout import Report
 
@@ -48,6 +50,32 @@ def test_it_is_one_worker_without_ray(config: Config) -> None:
     rate = summary.total.success_once.successes / 6
     assert 0 < rate < 1
     assert f"{100 * rate:.1f} %" in (summary.out / "report.html").read_text()
+
+
+@pytest.mark.parametrize(
+    ("changes", "workers"),
+    [
+        ({}, 0),
+        ({"workers": 3}, 3),
+        ({"episodes": 33}, 0),
+        ({"episodes": 34}, 1),
+        ({"episodes": 34, "env_options": {"max_steps": 10}}, 0),
+        ({"gpus_per_worker": 0.5}, 1),
+        ({"policy_url": "serve://pi0"}, 1),
+        ({"runtime_env": {"pip": ["einops"]}}, 1),
+    ],
+)
+def test_a_short_evaluation_that_needs_no_ray_has_no_workers(
+    changes: dict[str, Any], workers: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.delenv("RAY_ADDRESS", raising=False)
+    monkeypatch.setattr(in_process, "node_of_this_process", lambda: None)
+    assert in_process.chosen_workers(flat_config(envs=[LINE], out="out", **changes)) == workers
+
+
+def test_a_process_in_a_cluster_plays_there(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("RAY_ADDRESS", "10.0.0.1:6379")
+    assert in_process.chosen_workers(flat_config(envs=[LINE], out="out")) == 1
 
 
 def test_a_simulator_that_does_not_repeat_itself_leaves_one_failure_without_a_video_and_a_warning(
