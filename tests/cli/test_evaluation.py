@@ -20,8 +20,7 @@ from typer.testing import CliRunner
 
 from vlagents_ray.cli import evaluate as command
 from vlagents_ray.cli import evaluation as run
-from vlagents_ray.cli.evaluation import forecasts, print_plan
-from vlagents_ray.cli.live_results import live_address
+from vlagents_ray.cli.evaluation import forecasts, live_address, print_plan
 from vlagents_ray.cli.main import app
 from vlagents_ray.evaluate import EvalConfig, OutOfTime, PolicyConfig, Results, SuiteConfig, WorkerConfig
 from vlagents_ray.evaluate.episode.failures import Failure

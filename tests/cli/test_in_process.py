@@ -89,10 +89,14 @@ def test_named_policies_deployment_files_and_checkpoints_are_played_without_ray(
 
 
 REFUSED: Mapping[str, tuple[dict[str, object], list[str], str]] = {
-    "cluster": ({"url": "serve://pi0"}, [], "serve://pi0 is a policy inside a Ray cluster; want 1 or more"),
+    "cluster": ({"url": "serve://pi0"}, [], "serve://pi0 is inside a Ray cluster; want 1 or more"),
     "address": ({"source": "noop"}, ["--address", "auto"], "got 0 with --address, want 1 or more in a cluster"),
-    "packages": ({"source": "packages.yaml"}, [], "'a' has a runtime_env or another import_path"),
-    "worker": ({"source": "noop"}, [], "the runtime_env of the worker of 'eval_fakes:Line' has ['pip']"),
+    "packages": (
+        {"source": "packages.yaml"},
+        [],
+        "but 'Stepped' has a runtime_env, or another import_path",
+    ),
+    "worker": ({"source": "noop"}, [], "a worker's runtime_env has 'pip'"),
 }
 
 

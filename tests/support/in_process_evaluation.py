@@ -13,7 +13,7 @@ from vlagents_ray.evaluate.artifacts.recorder import save
 from vlagents_ray.evaluate.artifacts.storage import versions
 from vlagents_ray.evaluate.plan.jobs import plan
 from vlagents_ray.evaluate.results.store import Store
-from vlagents_ray.evaluate.workers.in_process import InProcessWorkers
+from vlagents_ray.evaluate.workers.base import InProcessWorkers
 from vlagents_ray.evaluate.workers.rollout import Rollout
 from vlagents_ray.interface import Agent
 

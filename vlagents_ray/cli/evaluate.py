@@ -153,13 +153,9 @@ def evaluate_command(options: EvalOptions) -> None:
         config = config_from_options(options)
         on_robot = config.real_robot is not None
         options.require_together(on_robot=on_robot)
-        from vlagents_ray.cli.evaluation import print_plan, run_evaluation, run_on_robot, watch_training
+        from vlagents_ray.cli.evaluation import live_address, print_plan, run_evaluation, run_on_robot, watch_training
 
-        address, page = options.address, None
-        if options.live or options.live_at:
-            from vlagents_ray.cli.live_results import live_address
-
-            page = live_address(options.live_at)
+        address, page = options.address, live_address(options.live_at) if options.live or options.live_at else None
         if on_robot:
             run_on_robot(config, address, operator=options.operator or "page", unblinded=options.unblind)
         elif options.dry_run:

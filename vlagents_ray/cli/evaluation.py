@@ -1,15 +1,17 @@
-"""Evaluations by their configuration: played, planned, watched or on a robot."""
+"""Evaluations by their configuration: played, planned, watched or on a robot, and the live page of `--live`."""
 
 from __future__ import annotations
 
 import contextlib
 import datetime
 import threading
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
+from urllib.parse import urlsplit
 
+import typer
 from rich.box import SIMPLE_HEAD
 from rich.table import Table
 
@@ -31,17 +33,90 @@ from vlagents_ray.evaluate import (
 from vlagents_ray.evaluate.checkpoint_watcher import CheckpointWatcher, rounds
 from vlagents_ray.evaluate.plan.cases import EvalCase, cells
 from vlagents_ray.evaluate.plan.jobs import plan
+from vlagents_ray.evaluate.report.results_document import ProgressDocument, ResultsDocument
 from vlagents_ray.evaluate.report.terminal import LineProgress
 from vlagents_ray.evaluate.results.database import FILE
 from vlagents_ray.evaluate.results.summary import errors_of_policies, failing_cells, summarize
-from vlagents_ray.evaluate.workers.in_process import chosen_workers
+from vlagents_ray.evaluate.workers.base import chosen_workers
 from vlagents_ray.policies.base.checkpoint import STEP
+from vlagents_ray.ray_tools.private import node_of_this_process
+from vlagents_ray.serve.access.api_keys import load_keys
 from vlagents_ray.serve.launch.deployment_file import own_settings
 from vlagents_ray.serve.models.checkpoints import CHOICE
+from vlagents_ray.serve.ports import LOOPBACK, is_free
 from vlagents_ray.slurm.submission import UNFINISHED
+
+if TYPE_CHECKING:
+    from vlagents_ray.serve.scaling.sibling_replicas import ReplicasInCluster
 
 POLICY_ERRORS = 3  # exit status: an error of the policy ended every episode of a cell
 LOOK_S = 1.0  # period at which the folder is read
+_PORT = 8050  # of the page, if it is free
+_NAME = "eval"  # the page's application, for keys that are limited to applications
+
+
+def live_address(at: str | None) -> tuple[str, int]:
+    """Return the (host, port) that `--live-at` states; None is `--live` alone."""
+    from vlagents_ray.serve.observers.live_page import require_watch_keys
+
+    if at is None:
+        return LOOPBACK, _PORT if is_free(LOOPBACK, _PORT) else 0
+    try:
+        parts = urlsplit(f"//{at}")
+        host, port = parts.hostname, parts.port
+    except ValueError:
+        host = port = None
+    if host is None or port is None or parts.netloc != at:
+        raise ConfigError(f"--live-at: got {at!r}, want HOST:PORT, as in 127.0.0.1:{_PORT}")
+    require_watch_keys(host, load_keys())  # before anything is served
+    return host, port
+
+
+@contextlib.contextmanager
+def shown_progress(config: EvalConfig, live: tuple[str, int] | None, *, goes_on: bool = False) -> Iterator[Progress]:
+    """Show an evaluation on the terminal and, if that has an address, on the live page, within the context of its Ray.
+
+    Without workers the terminal shows lines: a table that is drawn again would disturb a debugger.
+
+    Yields:
+        The progress to evaluate with.
+    """
+    progress = progress_for(out) if config.workers else LineProgress(out)
+    if live is None:
+        yield progress
+        return
+    from vlagents_ray.serve.scaling.sibling_replicas import ReplicasInCluster
+
+    document = ProgressDocument(config.out, progress, goes_on=goes_on)
+    urls = [str(one.url) for one in config.policies]
+    apps = [url.removeprefix("serve://") for url in urls if url.startswith("serve://")]
+    others = ReplicasInCluster(apps) if apps and node_of_this_process() is not None else None
+    with _page(document, others, live):
+        try:
+            yield document
+        except Exception as error:
+            if not isinstance(error, typer.Exit):
+                document.fail(str(error))
+            raise
+        finally:
+            document.close()
+
+
+def follow(results: Path, address: tuple[str, int]) -> None:
+    """Serve the page of an evaluation or a training that another process writes to a folder, until Ctrl-C."""
+    with _page(ResultsDocument(results), None, address), contextlib.suppress(KeyboardInterrupt):
+        threading.Event().wait()
+
+
+@contextlib.contextmanager
+def _page(document: ResultsDocument, others: ReplicasInCluster | None, address: tuple[str, int]) -> Iterator[None]:
+    from vlagents_ray.serve.observers.live_page import page_server
+    from vlagents_ray.serve.observers.live_view import Fleet
+
+    fleet = Fleet(None, others, document.read)
+    with page_server(fleet, address, load_keys(), name=_NAME, videos=document.video) as url:
+        out.print(f"live: {url}")
+        yield
 
 
 def run_evaluation(
@@ -61,21 +136,6 @@ def run_evaluation(
         progress = stack.enter_context(shown_progress(ready, live))
         summary = evaluate_and_print(ready, progress, end_at, agents)
     require_results(ready, summary)
-
-
-def shown_progress(
-    config: EvalConfig, live: tuple[str, int] | None, *, goes_on: bool = False
-) -> contextlib.AbstractContextManager[Progress]:
-    """Show an evaluation on the terminal and, if that has an address, on the live page, within the context of its Ray.
-
-    Without workers the terminal shows lines: a table that is drawn again would disturb a debugger.
-    """
-    progress = progress_for(out) if config.workers else LineProgress(out)
-    if live is None:
-        return contextlib.nullcontext(progress)
-    from vlagents_ray.cli.live_results import live_progress
-
-    return live_progress(config, progress, live, goes_on=goes_on)
 
 
 def play_one(config: EvalConfig, address: str | None, only: tuple[int, int]) -> Summary:

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import contextlib
+import math
 import os
 import re
 from collections.abc import Callable, Iterator, Mapping
 from functools import cache, partial
-from math import ceil
 from typing import Any
 
 from vlagents_ray.cli.console import out
@@ -20,7 +20,7 @@ from vlagents_ray.envs.base import known_contract
 from vlagents_ray.errors import ConfigError, ContractMismatch
 from vlagents_ray.evaluate import EvalConfig, PolicyConfig, check
 from vlagents_ray.evaluate.plan.cases import cells
-from vlagents_ray.evaluate.workers.in_process import chosen_workers
+from vlagents_ray.evaluate.workers.base import chosen_workers
 from vlagents_ray.evaluate.workers.rollout import THREAD_VARIABLES
 from vlagents_ray.interface import Agent
 from vlagents_ray.policies.base.accelerator import VISIBLE
@@ -54,78 +54,71 @@ def served(
         The evaluation with its number of workers and the URLs of its policies; and, without workers, the agents of the
         policies that are not at a URL.
     """
-    if config.workers == 0 and (address is not None or replica_per_gpu):
+    if config.workers == 0 and address is not None:
         raise ConfigError("workers: got 0 with --address, want 1 or more in a cluster, or no --address")
     with contextlib.ExitStack() as stack:
         on_ray = address is not None or config.real_robot is not None or chosen_workers(config) > 0
-        if not on_ray:
-            resolved_config, parts = resolve_policies(config)
-            needs = [need for part in parts.values() if (need := _needs_ray(part, chosen=config.workers == 0))]
-            if needs and config.workers == 0:
-                raise ConfigError(f"workers: got 0, which plays without Ray, but {needs[0]}; want 1 or more")
-            on_ray = bool(needs)
         if on_ray:
-            stack.enter_context(quiet_ray(None))
-            stack.enter_context(exit_if_ray_is_lost(RESUME))
-            if address is not None:
-                stack.enter_context(joined(address))
-            resolved_config, parts = resolve_policies(config)
-        _require_startable(resolved_config, parts, address)
+            _enter_ray(stack, address)
+        ready, parts = resolve_policies(config)
+        if not on_ray and not _playable_here(parts, config.workers):
+            on_ray = True
+            _enter_ray(stack)
+        # Raise errors before anything starts.
+        if address is None:
+            wanted = max(cell.worker.gpus for cell in cells(ready))
+            if wanted and wanted > (here := gpus_here()):  # Ray would never start these workers here
+                raise ConfigError(
+                    f"worker.gpus: a worker wants {wanted:g} GPUs, this machine has {here:g}; want less (0 draws in "
+                    f"software), or the --address of a cluster that has them"
+                )
+            for part in parts.values():
+                require_packages(part)
+        policy_contract = cache(lambda application: stated_contract(parts[application]))
+        for cell in cells(ready) if ready.real_robot is None else ():
+            application = str(cell.policy.url).removeprefix("serve://")
+            if application in parts and (env := known_contract(cell.env, cell.suite.env_options)) is not None:
+                try:
+                    require_match(policy_contract(application), env)
+                except ContractMismatch as error:
+                    raise ContractMismatch(f"{cell.policy.name!r} in {cell.env!r}: {error}") from None
+        check(ready)
         if not on_ray:
             if config.workers is None:
-                out.print(
-                    "a short evaluation, played in this process without Ray (--workers 1 starts Ray and a worker)"
-                )
-            yield _in_process(stack, resolved_config, parts)
+                out.print("a short evaluation, in this process without Ray (--workers 1 plays it in a worker of Ray)")
+            yield _in_process(stack, ready, parts)
             return
-        ready = resolved_config.model_copy(update={"workers": config.workers or 1})
+        workers = config.workers or 1
         if parts:
             from vlagents_ray.evaluate.workers.cluster import most_cpus, most_gpus
             from vlagents_ray.serve.launch.server import running_server, spread_over_gpus
 
             if replica_per_gpu:
-                parts = spread_over_gpus(parts, kept=(ready.workers or 1) * most_gpus(ready))
+                parts = spread_over_gpus(parts, kept=workers * most_gpus(ready))
             # Ray's CPUs are logical here: the requested number of workers must fit.
-            cpus = max(os.cpu_count() or 1, ceil((ready.workers or 1) * most_cpus(ready)))
+            cpus = max(os.cpu_count() or 1, math.ceil(workers * most_cpus(ready)))
             stack.enter_context(running_server(together(parts), address=address, num_cpus=cpus, ingress=False))
-        yield ready, {}
+        yield ready.model_copy(update={"workers": workers}), {}
 
 
-def _needs_ray(part: PlainDeployment, *, chosen: bool) -> str | None:
-    """Return why a policy needs Ray, as a clause; None if this process can play it.
-
-    Unless the user has `chosen` this process, policies with a GPU or with a Python of their own, which load for long,
-    are also left to Ray.
-    """
-    app = part.applications[0]
-    if app.import_path != IMPORT_PATH or app.runtime_env:
-        return f"{app.name!r} has a runtime_env or another import_path than {IMPORT_PATH}"
-    args = ServerArgs(**app.args)
-    if not chosen and (args.resources.num_gpus or args.environment.python):
-        return f"{app.name!r} has a GPU or its own Python"
-    return None
+def _enter_ray(stack: contextlib.ExitStack, address: str | None = None) -> None:
+    stack.enter_context(quiet_ray(None))
+    stack.enter_context(exit_if_ray_is_lost(RESUME))
+    if address is not None:
+        stack.enter_context(joined(address))
 
 
-def _require_startable(config: EvalConfig, parts: Mapping[str, PlainDeployment], address: str | None) -> None:
-    """Raise the errors of an evaluation that can be found before anything starts."""
-    if address is None:
-        wanted = max(cell.worker.gpus for cell in cells(config))
-        if wanted and wanted > (here := gpus_here()):  # Ray would never start these workers here
-            raise ConfigError(
-                f"worker.gpus: a worker wants {wanted:g} GPUs, this machine has {here:g}; want less (0 draws in "
-                f"software), or the --address of a cluster that has them"
-            )
-        for part in parts.values():
-            require_packages(part)
-    policy_contract = cache(lambda application: stated_contract(parts[application]))
-    for cell in cells(config) if config.real_robot is None else ():
-        application = str(cell.policy.url).removeprefix("serve://")
-        if application in parts and (env := known_contract(cell.env, cell.suite.env_options)) is not None:
-            try:
-                require_match(policy_contract(application), env)
-            except ContractMismatch as error:
-                raise ContractMismatch(f"{cell.policy.name!r} in {cell.env!r}: {error}") from None
-    check(config)
+def _playable_here(parts: Mapping[str, PlainDeployment], workers: int | None) -> bool:
+    """Return whether this process is to play these policies; raise `ConfigError` if it cannot and `workers` is 0."""
+    for name, part in parts.items():
+        app = only_application(name, part)
+        args = ServerArgs(**app.args) if app.import_path == IMPORT_PATH and not app.runtime_env else None
+        if workers == 0 and (args is None or args.environment.python):
+            need = "a runtime_env, or another import_path" if args is None else args.environment.python
+            raise ConfigError(f"workers: got 0, which plays in this Python, but {name!r} has {need}; want 1 or more")
+        if args is None or args.environment.python or (args.resources.num_gpus and workers is None):
+            return False
+    return True
 
 
 def _in_process(
@@ -137,13 +130,11 @@ def _in_process(
         if (part := parts.get(str(policy.url).removeprefix("serve://"))) is not None:
             app = only_application(policy.name, part)
             args = ServerArgs(**app.args)
-            gpus += args.resources.num_gpus
-            agents[policy.name] = partial(LocalPolicy, args, own_settings(app))
-            policy = policy.model_copy(update={"url": None})  # noqa: PLW2901 - the one that is played
-        policies.append(policy)
+            agents[policy.name], gpus = partial(LocalPolicy, args, own_settings(app)), gpus + args.resources.num_gpus
+        policies.append(policy if part is None else policy.model_copy(update={"url": None}))
     # As in workers and replicas, for the same results.
-    limits = dict.fromkeys(THREAD_VARIABLES, str(config.worker.threads)) | ({} if gpus else {VISIBLE: ""})
-    stack.enter_context(variables(limits))
+    hidden = {} if gpus else {VISIBLE: ""}
+    stack.enter_context(variables(dict.fromkeys(THREAD_VARIABLES, str(config.worker.threads)) | hidden))
     return config.model_copy(update={"policies": policies, "workers": 0}), agents
 
 

@@ -33,7 +33,7 @@ def report_command(
 
     with errors():
         if live or live_at:
-            from vlagents_ray.cli.live_results import follow, live_address
+            from vlagents_ray.cli.evaluation import follow, live_address
 
             if len(folders) != 1 or html is not None:
                 raise ConfigError("--live shows one folder, and writes no file: want one OUT, and no --html")

@@ -25,8 +25,7 @@ from vlagents_ray.evaluate.results.statistics import Stopping
 from vlagents_ray.evaluate.results.store import Store
 from vlagents_ray.evaluate.results.summary import Summary, summarize, write_summary
 from vlagents_ray.evaluate.trackers import TrackerFeed
-from vlagents_ray.evaluate.workers.base import FailedAttempts, Workers, dispatch
-from vlagents_ray.evaluate.workers.in_process import InProcessWorkers, chosen_workers
+from vlagents_ray.evaluate.workers.base import FailedAttempts, InProcessWorkers, Workers, chosen_workers, dispatch
 from vlagents_ray.evaluate.workers.rollout import AgentFactory, OwnAgents, Report, agents, factory_program
 from vlagents_ray.ray_tools.signals import stop_signals
 

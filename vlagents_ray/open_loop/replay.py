@@ -29,7 +29,7 @@ from vlagents_ray.open_loop.recorded import (
 )
 from vlagents_ray.serve.config.deployment import ServerArgs
 from vlagents_ray.serve.launch.deployment_file import own_settings, policy_application
-from vlagents_ray.serve.local_agent import LocalAgent, local_engine
+from vlagents_ray.serve.local_agent import LocalPolicy
 from vlagents_ray.serve.models.checkpoints import CHOICE, STEP
 from vlagents_ray.serve.weights import OPTION
 
@@ -50,12 +50,9 @@ def candidate(source: str) -> Iterator[Sessions]:
         yield partial(RemoteAgent, source, rank="simulation", codec="exact")
         return
     application = policy_application(source)
-    engine = local_engine(ServerArgs(**application.args), own_settings(application))
-    try:
-        engine.start()
-        yield partial(LocalAgent, engine)
-    finally:
-        engine.close()
+    with LocalPolicy(ServerArgs(**application.args), own_settings(application), threaded=True) as policy:
+        policy.initialize()
+        yield lambda: policy.sessions(1)[0]
 
 
 @dataclass

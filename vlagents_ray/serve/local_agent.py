@@ -20,27 +20,32 @@ from vlagents_ray.serve.engine.engine import Engine
 from vlagents_ray.serve.models.checkpoints import resolved
 from vlagents_ray.serve.python_env.child_agent import make_agent, version_of
 from vlagents_ray.serve.requests import PendingRequest, Rank
+from vlagents_ray.serve.sessions import SessionFinder
 
 _LOOK_S = 0.1  # wait for a checkpoint that another thread loads
 
 
-def local_engine(args: ServerArgs, config: Mapping[str, Any]) -> Engine:
+def build_engine(args: ServerArgs, config: Mapping[str, Any], finder: SessionFinder | None = None) -> Engine:
     """Create the engine of a deployment, without loading its policy.
 
     Args:
-        args: The settings. A policy with its own Python environment runs in a child process.
+        args: The settings, with `environment.process` decided.
         config: The settings of the policy, with those of the deployment's `user_config`.
+        finder: Fetches sessions from other replicas.
     """
-    if args.environment.python is not None:
-        args = args.model_copy(update={"environment": args.environment.model_copy(update={"process": "child"})})
     return Engine(
         args.checkpoints.of(partial(make_agent, args), config),
         max_batch_size=args.batch.max_size,
         patience=args.batch.patience,
         batch_sizes=args.batch.sizes or (),
+        session_limit=args.sessions.limit,
+        session_idle_s=args.sessions.idle_s,
         version=version_of(args),
+        check=args.dialects.require_fit,
         limits=args.limits.call_limits(),
         reply_bytes=args.limits.reply_bytes,
+        in_flight_bytes=args.limits.in_flight_bytes,
+        finder=finder,
     )
 
 
@@ -119,12 +124,20 @@ class LocalAgent(Agent):
 
 
 class LocalPolicy(LocalAgent):
-    """A deployment's policy as an agent, whose calls run on the calling thread, so that a debugger stops in them."""
+    """A deployment's policy as an agent, of which `sessions` opens more sessions."""
 
-    def __init__(self, args: ServerArgs, config: Mapping[str, Any]) -> None:
-        """Set the policy; `initialize` loads it. The arguments are those of `local_engine`."""
-        super().__init__(local_engine(args, config))
-        self._args, self._code = args, args.code()
+    def __init__(self, args: ServerArgs, config: Mapping[str, Any], *, threaded: bool = False) -> None:
+        """Set the policy; `initialize` loads it.
+
+        Args:
+            args: The settings; a policy in a Python environment of its own runs in a child process.
+            config: The settings of the policy, with those of the deployment's `user_config`.
+            threaded: Whether a thread runs the policy, in batches of sessions that act at once. By default the caller's
+                does, so that a debugger stops in it.
+        """
+        environment = args.environment.model_copy(update={"process": "child"})
+        super().__init__(build_engine(args.model_copy(update={"environment": environment}), config))
+        self._args, self._code, self._threaded = args, args.code(), threaded
 
     @property
     def metadata(self) -> dict[str, Any]:
@@ -132,7 +145,7 @@ class LocalPolicy(LocalAgent):
         return policy_metadata(self._args, self._engine, *self._code)
 
     def initialize(self) -> None:
-        self._engine.start(threaded=False)
+        self._engine.start(threaded=self._threaded)
 
     def sessions(self, n: int) -> list[LocalAgent]:
         """Open `n` more sessions, for `act_batch` of this agent; close each of them."""

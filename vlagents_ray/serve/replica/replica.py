@@ -36,12 +36,11 @@ from vlagents_ray.serve.endpoints.websocket import WebSocketServer
 from vlagents_ray.serve.endpoints.weights import weights_routes
 from vlagents_ray.serve.engine.engine import Engine
 from vlagents_ray.serve.engine.sender import Sender
-from vlagents_ray.serve.local_agent import policy_metadata
+from vlagents_ray.serve.local_agent import build_engine, policy_metadata
 from vlagents_ray.serve.observers.live_page import live_routes
 from vlagents_ray.serve.observers.live_view import Fleet
 from vlagents_ray.serve.observers.opening import open_observers
 from vlagents_ray.serve.ports import EVERYWHERE, HOST, LOOPBACK
-from vlagents_ray.serve.python_env.child_agent import make_agent, version_of
 from vlagents_ray.serve.queue.batch_queue import LoadMeter
 from vlagents_ray.serve.replica.metrics import Exporter, tags_of
 from vlagents_ray.serve.scaling.autoscaling import SESSIONS, UTILISATION, WAITING
@@ -91,7 +90,7 @@ class PolicyReplica(ClientApi, SiblingApi):
         self._peers = SiblingReplicas()
         self._migrator = SessionMigrator(self._peers.others, asyncio.get_running_loop())
         self._limits = settings.limits.limits()
-        self._engine = _engine(settings, self._limits, self._migrator)
+        self._engine = _engine(settings, self._migrator)
         self._configured = False
         self._migrator.start(self._engine)
         self._rebalancer = Rebalancer(self._engine, self._peers, self._load_of)
@@ -343,26 +342,13 @@ class PolicyReplica(ClientApi, SiblingApi):
             await asyncio.sleep(_GATEWAY_POLL_S)
 
 
-def _engine(args: ServerArgs, limits: Limits, migrator: SessionMigrator) -> Engine:
+def _engine(args: ServerArgs, migrator: SessionMigrator) -> Engine:
     """Create the engine, without loading the policy."""
     if 0 < args.resources.num_gpus < 1:
         os.environ.setdefault(GPU_SHARE, str(args.resources.num_gpus))
     if VISIBLE not in args.environment.env_vars:
         hide_gpus(ray.get_runtime_context().get_accelerator_ids().get("GPU", []))
-    return Engine(
-        args.checkpoints.of(partial(make_agent, args), args.config),
-        max_batch_size=args.batch.max_size,
-        patience=args.batch.patience,
-        batch_sizes=args.batch.sizes or (),
-        session_limit=args.sessions.limit,
-        session_idle_s=args.sessions.idle_s,
-        version=version_of(args),
-        check=args.dialects.require_fit,
-        limits=args.limits.call_limits(),
-        reply_bytes=limits.reply_bytes,
-        in_flight_bytes=limits.in_flight_bytes,
-        finder=migrator,
-    )
+    return build_engine(args, args.config, migrator)
 
 
 def _stream_endpoint(engine: Engine, args: ServerArgs, admit: Admit | NoKey) -> WebSocketServer:
