@@ -131,6 +131,8 @@ def run_evaluation(
 
     `end_at` is as in `evaluate`, and `live` the address of the live page, as for `shown_progress`.
     """
+    if live is not None and config.workers is None:  # the page also shows the sessions of replicas
+        config = config.model_copy(update={"workers": 1})
     with contextlib.ExitStack() as stack:
         ready, agents = stack.enter_context(served(config, address, replica_per_gpu=replica_per_gpu))
         progress = stack.enter_context(shown_progress(ready, live))
