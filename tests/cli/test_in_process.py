@@ -79,7 +79,7 @@ def test_named_policies_deployment_files_and_checkpoints_are_played_without_ray(
         [*POISON, "eval", "runs.yaml"], capture_output=True, text=True, timeout=120, check=False, cwd=folder
     )
     assert done.returncode == 0, done.stdout + done.stderr
-    assert "a short evaluation, played in this process without Ray (--workers 1 starts" in done.stdout
+    assert "a short evaluation, in this process without Ray (--workers 1 plays" in done.stdout
     cells = {cell.contender: cell for cell in Results.load(folder / "runs" / "runs").cells}
     actions = {name: [one.result.actions_sha256 for one in cell.episodes] for name, cell in cells.items()}
     assert actions["swept@2"] == actions["chosen"]
