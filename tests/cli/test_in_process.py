@@ -94,7 +94,7 @@ REFUSED: Mapping[str, tuple[dict[str, object], list[str], str]] = {
     "packages": (
         {"source": "packages.yaml"},
         [],
-        "but 'Stepped' has a runtime_env, or another import_path",
+        "but 'noop' has a runtime_env, or another import_path",
     ),
     "worker": ({"source": "noop"}, [], "a worker's runtime_env has 'pip'"),
 }
@@ -103,7 +103,7 @@ REFUSED: Mapping[str, tuple[dict[str, object], list[str], str]] = {
 @pytest.mark.parametrize("why", REFUSED)
 def test_what_only_ray_can_do_is_refused(why: str, folder: Path) -> None:
     policy, words, text = REFUSED[why]
-    packages = deployment()
+    packages = deployment(policy="noop")
     packages["applications"][0]["runtime_env"] = {"pip": ["einops"]}  # type: ignore[index]
     (folder / "packages.yaml").write_text(yaml.safe_dump(packages))
     plan = {"policies": [policy], "suites": [{"envs": [LINE]}], "workers": 0}
@@ -124,6 +124,7 @@ def test_a_debugger_stops_in_the_policy_with_the_terminal_and_leaving_it_ends_th
         for text, answer in ((b"(Pdb) ", b"self.length * 84\n"), (b"42.0\r\n(Pdb) ", b"q\n")):
             seen = b""
             while not seen.endswith(text):
+                assert process.poll() is None, seen.decode()
                 seen += os.read(ours, 4096)
             os.write(ours, answer)
         assert process.wait(60) == 130

@@ -29,10 +29,10 @@ from vlagents_ray.ray_tools.session import joined, variables
 from vlagents_ray.serve.config.deployment import ServerArgs
 from vlagents_ray.serve.launch.deployment_file import (
     IMPORT_PATH,
-    PlainDeployment,
+    Deployment,
     only_application,
     own_settings,
-    read_policy,
+    read_deployment,
     stated_contract,
     together,
     with_settings,
@@ -108,7 +108,7 @@ def _enter_ray(stack: contextlib.ExitStack, address: str | None = None) -> None:
         stack.enter_context(joined(address))
 
 
-def _playable_here(parts: Mapping[str, PlainDeployment], workers: int | None) -> bool:
+def _playable_here(parts: Mapping[str, Deployment], workers: int | None) -> bool:
     """Return whether this process is to play these policies; raise `ConfigError` if it cannot and `workers` is 0."""
     for name, part in parts.items():
         app = only_application(name, part)
@@ -122,7 +122,7 @@ def _playable_here(parts: Mapping[str, PlainDeployment], workers: int | None) ->
 
 
 def _in_process(
-    stack: contextlib.ExitStack, config: EvalConfig, parts: Mapping[str, PlainDeployment]
+    stack: contextlib.ExitStack, config: EvalConfig, parts: Mapping[str, Deployment]
 ) -> tuple[EvalConfig, Agents]:
     """Return the evaluation without workers, and the agents of its policies that are not at a URL."""
     policies, agents, gpus = [], {}, 0.0
@@ -138,18 +138,18 @@ def _in_process(
     return config.model_copy(update={"policies": policies, "workers": 0}), agents
 
 
-def resolve_policies(config: EvalConfig, *, ask: bool = True) -> tuple[EvalConfig, dict[str, PlainDeployment]]:
+def resolve_policies(config: EvalConfig, *, ask: bool = True) -> tuple[EvalConfig, dict[str, Deployment]]:
     """Find the names, URLs and deployments of the policies of an evaluation.
 
     Returns:
         The evaluation with names and URLs of its policies; and the deployments to start for it, by application.
     """
-    parts: dict[str, PlainDeployment] = {}
+    parts: dict[str, Deployment] = {}
     policies = [_resolve_policy(policy, parts, ask=ask) for policy in config.policies]
     return type(config).model_validate(config.model_dump(exclude_unset=True) | {"policies": policies}), parts
 
 
-def _resolve_policy(policy: PolicyConfig, parts: dict[str, PlainDeployment], *, ask: bool) -> PolicyConfig:
+def _resolve_policy(policy: PolicyConfig, parts: dict[str, Deployment], *, ask: bool) -> PolicyConfig:
     """Add name and URL to `policy`; add its deployment to `parts` unless a server has it."""
     url = policy.source if policy.source is not None and "://" in policy.source else policy.url
     if url is not None:
@@ -176,8 +176,8 @@ def _resolve_policy(policy: PolicyConfig, parts: dict[str, PlainDeployment], *, 
     return policy.model_copy(update=found)
 
 
-def policy_deployment(policy: PolicyConfig, source: str, *, step_follows: bool = False) -> PlainDeployment:
-    """Read the deployment of `source` with the settings of `policy`; `step_follows` as in `read_policy`."""
+def policy_deployment(policy: PolicyConfig, source: str, *, step_follows: bool = False) -> Deployment:
+    """Read the deployment of `source` with the settings of `policy`; `step_follows` as in `read_deployment`."""
     of_name = {"config": policy.config} if policy.config and not source.endswith(YAML_SUFFIXES) else None
-    read = read_policy(source, of_name, step_follows=step_follows)
+    read = read_deployment(source, of_name, step_follows=step_follows)
     return with_settings(read, policy.config, steps=bool(policy.steps), step_follows=step_follows)

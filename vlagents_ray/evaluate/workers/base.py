@@ -46,7 +46,8 @@ def chosen_workers(config: EvalConfig) -> int:
         raise ConfigError(f"workers: got 0, which plays in this process without Ray, but {needs[0]}; want 1 or more")
     if config.workers is not None:
         return config.workers
-    steps = sum(cell.planned * int(cell.suite.env_options.get("max_steps") or _STEPS) for cell in planned)  # type: ignore[arg-type]
+    limits = [(cell.planned, cell.suite.env_options.get("max_steps")) for cell in planned]
+    steps = sum(episodes * (limit if isinstance(limit, int) else _STEPS) for episodes, limit in limits)
     in_cluster = node_of_this_process() is not None or bool(os.environ.get("RAY_ADDRESS"))
     return int(bool(needs) or in_cluster or any(cell.worker.gpus for cell in planned) or steps > SHORT_STEPS)
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import yaml
 from pydantic import BaseModel, Field, ValidationError
@@ -23,53 +23,68 @@ from vlagents_ray.serve.requests import DEFAULT
 from vlagents_ray.settings import wrong_settings
 
 if TYPE_CHECKING:
-    from ray.serve.schema import ServeApplicationSchema, ServeDeploySchema
+    from ray.serve.schema import ServeDeploySchema
 
 IMPORT_PATH = "vlagents_ray.serve.app:build"
 DEFAULT_HOST, DEFAULT_PORT = "127.0.0.1", 8000
+_OUR_APP_KEYS = {"name", "route_prefix", "import_path", "args"}  # without those that Serve must apply
+
+
+class HttpSettings(BaseModel, extra="allow"):
+    """Where the server listens; Serve's own default is all interfaces."""
+
+    host: str = DEFAULT_HOST
+    port: int = DEFAULT_PORT
 
 
 class DeploymentSettings(BaseModel, extra="allow"):
-    """The settings of a deployment beside `args`, of an application."""
+    """The settings of one deployment of an application, beside `args`."""
 
     name: str
     user_config: Any = None
 
 
-class PlainApplication(BaseModel, extra="allow"):
-    """An application, as in Serve's `ServeApplicationSchema`."""
+class Application(BaseModel, extra="allow"):
+    """An application, of this package or another one."""
 
     name: str = "default"
-    route_prefix: str | None = "/"
+    route_prefix: Annotated[str, Field(pattern="^/")] | None = "/"
     import_path: str
     args: dict[str, Any] = {}
     runtime_env: dict[str, Any] = {}
     deployments: list[DeploymentSettings] = []
 
 
-class PlainDeployment(BaseModel, extra="allow"):
-    """A deployment file as far as this package reads it, without importing Ray; `together` has Serve check the rest."""
+class Deployment(BaseModel, extra="allow"):
+    """A deployment file: what this package reads of Serve's schema, which is read without importing Ray."""
 
-    applications: list[PlainApplication] = Field(min_length=1)
+    applications: list[Application] = Field(min_length=1)
+    http_options: HttpSettings = HttpSettings()
+    proxy_location: Literal["Disabled", "HeadOnly", "EveryNode"] | None = None
+
+    @property
+    def plain(self) -> bool:
+        """Whether all applications are of this package, without settings that Serve must apply."""
+        beside = self.model_extra or self.http_options.model_extra
+        stated = [app.model_dump(exclude_defaults=True).keys() for app in self.applications]
+        return not beside and our_apps(self) == self.applications and all(keys <= _OUR_APP_KEYS for keys in stated)
+
+    def for_serve(self) -> ServeDeploySchema:
+        """Return Serve's schema of the file; raises `ValidationError` if a setting of Serve is wrong."""
+        from ray.serve.schema import ServeDeploySchema  # takes a second
+
+        return ServeDeploySchema.model_validate(self.model_dump(exclude_unset=True))
 
 
-Deployment = TypeVar("Deployment", "ServeDeploySchema", PlainDeployment)
-
-
-def deployment(policy: str, **args: Any) -> ServeDeploySchema:
+def deployment(policy: str, **args: Any) -> Deployment:
     """Return the deployment of one policy, as if read from a file; `args` are those of `ServerArgs`."""
-    return _checked(_of_name(policy, args), f"policy {policy!r}", schema=_serve_schema())
+    return _of_name(policy, args)
 
 
-def read_deployment(source: str, overrides: Mapping[str, Any] | None = None) -> ServeDeploySchema:
-    """Read and check a deployment as `read_policy` does, and the settings of Serve."""
-    return _read(source, overrides or {}, _serve_schema())
-
-
-def read_policy(
+def read_deployment(
     source: str, overrides: Mapping[str, Any] | None = None, *, step_follows: bool = False
-) -> PlainDeployment:
-    """Read a deployment and check it, apart from the settings of Serve.
+) -> Deployment:
+    """Read a deployment and check it.
 
     Args:
         source: A YAML file, or the name of a policy.
@@ -80,18 +95,6 @@ def read_policy(
     Raises:
         ConfigError: The file or a setting is invalid.
     """
-    return _read(source, overrides or {}, PlainDeployment, step_follows=step_follows)
-
-
-def _serve_schema() -> type[ServeDeploySchema]:
-    from ray.serve.schema import ServeDeploySchema  # takes a second
-
-    return ServeDeploySchema
-
-
-def _read(
-    source: str, overrides: Mapping[str, Any], schema: type[Deployment], *, step_follows: bool = False
-) -> Deployment:
     path = Path(source)
     if path.suffix in (".yaml", ".yml"):
         if not path.is_file():
@@ -103,10 +106,10 @@ def _read(
             document = yaml.safe_load(path.read_text())
         except yaml.YAMLError as error:
             raise ConfigError(f"{source}: not YAML ({error})") from error
-        return _checked(document, source, schema, step_follows)
+        return _checked(document, source, step_follows)
     if ":" not in source and source not in names("policies"):
         policy_class(source)  # raises an error with the list of choices
-    return _checked(_of_name(source, overrides), f"policy {source!r}", schema, step_follows)
+    return _of_name(source, overrides or {}, step_follows)
 
 
 def server_args(source: str, app: str | None = None) -> ServerArgs:
@@ -114,9 +117,9 @@ def server_args(source: str, app: str | None = None) -> ServerArgs:
     return ServerArgs(**policy_application(source, app).args)
 
 
-def policy_application(source: str, app: str | None = None) -> PlainApplication:
+def policy_application(source: str, app: str | None = None) -> Application:
     """Return one application of a deployment that serves a policy: the one named `app`, or the only one."""
-    ours: dict[str, PlainApplication] = {one.name: one for one in our_apps(read_policy(source))}
+    ours: dict[str, Application] = {one.name: one for one in our_apps(read_deployment(source))}
     if app is None and len(ours) == 1:
         [app] = ours
     if app not in ours:
@@ -124,7 +127,7 @@ def policy_application(source: str, app: str | None = None) -> PlainApplication:
     return ours[app]
 
 
-def with_gateways_at(config: ServeDeploySchema, host: str) -> ServeDeploySchema:
+def with_gateways_at(config: Deployment, host: str) -> Deployment:
     """Return the deployment, with `host` as the default host of dialects that have their own port."""
     changed = config.model_copy(deep=True)
     for app in our_apps(changed):
@@ -133,7 +136,7 @@ def with_gateways_at(config: ServeDeploySchema, host: str) -> ServeDeploySchema:
     return changed
 
 
-def with_dialect(config: ServeDeploySchema, name: str, settings: Mapping[str, Any]) -> ServeDeploySchema:
+def with_dialect(config: Deployment, name: str, settings: Mapping[str, Any]) -> Deployment:
     """Return the deployment of one application, with these settings of a dialect in place of the file's."""
     changed = config.model_copy(deep=True)
     if len(our_apps(changed)) != 1:
@@ -145,7 +148,7 @@ def with_dialect(config: ServeDeploySchema, name: str, settings: Mapping[str, An
     return changed
 
 
-def only_application(name: str, part: ServeDeploySchema | PlainDeployment) -> Any:
+def only_application(name: str, part: Deployment) -> Application:
     """Return the application of a deployment for the policy `name`; raises `ConfigError` if it holds several."""
     if len(part.applications) != 1:
         found = [one.name for one in part.applications]
@@ -153,7 +156,7 @@ def only_application(name: str, part: ServeDeploySchema | PlainDeployment) -> An
     return part.applications[0]
 
 
-def together(policies: Mapping[str, ServeDeploySchema | PlainDeployment]) -> ServeDeploySchema:
+def together(policies: Mapping[str, Deployment]) -> Deployment:
     """Join several policies into one deployment, each as an application under its name, without dialects.
 
     Raises:
@@ -164,7 +167,7 @@ def together(policies: Mapping[str, ServeDeploySchema | PlainDeployment]) -> Ser
         app = only_application(name, part).model_dump(exclude_unset=True)
         app.get("args", {}).pop("dialects", None)
         applications.append(app | {"name": name, "route_prefix": f"/{name}"})
-    return _checked({"applications": applications}, ", ".join(policies), _serve_schema())
+    return _checked({"applications": applications}, ", ".join(policies))
 
 
 def with_settings(
@@ -172,7 +175,7 @@ def with_settings(
 ) -> Deployment:
     """Return the deployment, with these settings of its policies in place of the file's.
 
-    With `steps`, sessions may choose any checkpoint step. See `read_policy` for `step_follows`.
+    With `steps`, sessions may choose any checkpoint step. See `read_deployment` for `step_follows`.
     """
     changed = config.model_copy(deep=True)
     for app in our_apps(changed):
@@ -180,7 +183,7 @@ def with_settings(
         app.deployments = [one for one in app.deployments if one.name != POLICY]
         if steps:
             app.args["checkpoints"] = (app.args.get("checkpoints") or {}) | {"steps": True}
-    return _checked(changed.model_dump(exclude_unset=True), "settings", type(config), step_follows)
+    return _checked(changed.model_dump(exclude_unset=True), "settings", step_follows)
 
 
 def with_replicas_on(config: Deployment, gpus: float) -> Deployment:
@@ -197,20 +200,13 @@ def with_replicas_on(config: Deployment, gpus: float) -> Deployment:
     return changed
 
 
-def listens_at(config: ServeDeploySchema) -> tuple[str, int]:
-    """Return host and port of the file, or the defaults of this package; Serve would listen on all interfaces."""
-    http = config.http_options
-    stated = http.model_fields_set
-    return http.host if "host" in stated else DEFAULT_HOST, http.port if "port" in stated else DEFAULT_PORT
-
-
-def own_settings(app: ServeApplicationSchema | PlainApplication) -> dict[str, Any]:
+def own_settings(app: Application) -> dict[str, Any]:
     """Return the policy's settings: `config`, and `user_config`, which may change while the policy runs."""
     beside = [one.user_config for one in app.deployments if one.name == POLICY and isinstance(one.user_config, dict)]
     return {**app.args.get("config", {}), **(beside[0] if beside else {})}
 
 
-def stated_contract(config: PlainDeployment) -> Contract | None:
+def stated_contract(config: Deployment) -> Contract | None:
     """Return the contract of a deployment's policy, without loading the policy.
 
     Returns:
@@ -224,21 +220,23 @@ def stated_contract(config: PlainDeployment) -> Contract | None:
     return _contract(args, offered, offered.settings(DEFAULT, offered.config))
 
 
-def our_apps(config: ServeDeploySchema | PlainDeployment) -> list[Any]:
+def our_apps(config: Deployment) -> list[Application]:
     """Return the applications of a deployment that serve a policy."""
     return [app for app in config.applications if app.import_path == IMPORT_PATH]
 
 
-def _of_name(policy: str, args: Mapping[str, Any]) -> dict[str, Any]:
+def _of_name(policy: str, args: Mapping[str, Any], step_follows: bool = False) -> Deployment:
     name = policy.rpartition(":")[2]
     app = {"name": name, "route_prefix": "/", "import_path": IMPORT_PATH, "args": {"policy": policy, **args}}
-    return {"applications": [app]}
+    return _checked({"applications": [app]}, f"policy {policy!r}", step_follows)
 
 
-def _checked(document: object, source: str, schema: type[Deployment], step_follows: bool = False) -> Deployment:
-    """Return the document as that schema, with the `args` of this package checked before anything starts."""
+def _checked(document: object, source: str, step_follows: bool = False) -> Deployment:
+    """Return the document, with the `args` of this package and the settings of Serve checked before anything starts."""
     try:
-        config = schema.model_validate(document)
+        config = Deployment.model_validate(document)
+        if not config.plain or len(config.applications) > 1:
+            config.for_serve()
         for runtime_env in _runtime_envs(config):
             require_no_secrets(runtime_env)
         for app in our_apps(config):
@@ -248,21 +246,19 @@ def _checked(document: object, source: str, schema: type[Deployment], step_follo
                 app.args["environment"] = args.environment.model_dump(exclude_unset=True)
             if args.record is not None:
                 app.args["record"] = args.record.model_dump(exclude_unset=True)
-            installed = not (app.runtime_env or {})
-            _require_policy(args, own_settings(app), installed=installed, step_follows=step_follows)
+            _require_policy(args, own_settings(app), installed=not app.runtime_env, step_follows=step_follows)
     except ValidationError as error:
-        model = ServerArgs if error.title == ServerArgs.__name__ else schema
+        model = ServerArgs if error.title == ServerArgs.__name__ else Deployment
         raise ConfigError(f"{source}: {wrong_settings(error, model)}") from error
     return config
 
 
-def _runtime_envs(config: ServeDeploySchema | PlainDeployment) -> Iterator[Mapping[str, Any]]:
+def _runtime_envs(config: Deployment) -> Iterator[Mapping[str, Any]]:
     """Yield the runtime environments of the applications and of their deployments."""
     for app in config.applications:
-        yield app.runtime_env or {}
+        yield app.runtime_env
         for one in app.deployments:
-            options = one.model_dump(include={"ray_actor_options"}, exclude_unset=True).get("ray_actor_options") or {}
-            yield options.get("runtime_env") or {}
+            yield ((one.model_extra or {}).get("ray_actor_options") or {}).get("runtime_env") or {}
 
 
 def _require_policy(args: ServerArgs, own: dict[str, Any], *, installed: bool, step_follows: bool) -> None:
