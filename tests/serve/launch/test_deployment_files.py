@@ -37,14 +37,9 @@ def application(args: str) -> str:
         (application("{policy: noop, dialects: {gr00t: {mapping: gr01t}}}"), "gr01t"),
         (application("{policy: noop, replicas: 1, autoscaling: {}}"), "exclude each other"),
         ("applications: 3", "applications"),
-        (application("{policy: noop}") + "\nhttp_options: {prt: 1}", "prt"),
         (application("{policy: noop}") + "\nproxy_location: Nowhere", "proxy_location"),
         (application("{policy: noop}") + "\nlogging_config: {log_level: 3}", "log_level"),
         (application("{policy: noop}").replace("name: a", "name: a, route_prefix: b"), "route_prefix"),
-        (
-            application("{policy: noop}").replace("name: a", "name: a, deployments: [{name: Policy, replicas: 1}]"),
-            "replicas",
-        ),
         ("a: [", "YAML"),
     ],
 )
