@@ -61,8 +61,8 @@ def served(
         if on_ray:
             _enter_ray(stack, address)
         ready, parts = resolve_policies(config)
-        if not on_ray and not _playable_here(parts, config.workers):
-            on_ray = True
+        local = None if on_ray else _local_policies(parts, config.workers)
+        if not on_ray and local is None:
             _enter_ray(stack)
         # Raise errors before anything starts.
         if address is None:
@@ -83,10 +83,16 @@ def served(
                 except ContractMismatch as error:
                     raise ContractMismatch(f"{cell.policy.name!r} in {cell.env!r}: {error}") from None
         check(ready)
-        if not on_ray:
+        if local is not None:
             if config.workers is None:
                 out.print("a short evaluation, in this process without Ray (--workers 1 plays it in a worker of Ray)")
-            yield _in_process(stack, ready, parts)
+            # As in workers and replicas, for the same results.
+            hidden = {} if any(one.args[0].resources.num_gpus for one in local.values()) else {VISIBLE: ""}
+            stack.enter_context(variables(dict.fromkeys(THREAD_VARIABLES, str(ready.worker.threads)) | hidden))
+            apps = {one.name: str(one.url).removeprefix("serve://") for one in ready.policies}
+            agents = {name: local[app] for name, app in apps.items() if app in local}
+            own = [one.model_copy(update={"url": None}) if one.name in agents else one for one in ready.policies]
+            yield ready.model_copy(update={"policies": own, "workers": 0}), agents
             return
         workers = config.workers or 1
         if parts:
@@ -108,8 +114,12 @@ def _enter_ray(stack: contextlib.ExitStack, address: str | None = None) -> None:
         stack.enter_context(joined(address))
 
 
-def _playable_here(parts: Mapping[str, Deployment], workers: int | None) -> bool:
-    """Return whether this process is to play these policies; raise `ConfigError` if it cannot and `workers` is 0."""
+def _local_policies(parts: Mapping[str, Deployment], workers: int | None) -> dict[str, partial[LocalPolicy]] | None:
+    """Return the policies for this process by application; None if Ray is to play them.
+
+    Raises `ConfigError` if `workers` is 0 and Ray would have to.
+    """
+    found = {}
     for name, part in parts.items():
         app = only_application(name, part)
         args = ServerArgs(**app.args) if app.import_path == IMPORT_PATH and not app.runtime_env else None
@@ -117,25 +127,9 @@ def _playable_here(parts: Mapping[str, Deployment], workers: int | None) -> bool
             need = "a runtime_env, or another import_path" if args is None else args.environment.python
             raise ConfigError(f"workers: got 0, which plays in this Python, but {name!r} has {need}; want 1 or more")
         if args is None or args.environment.python or (args.resources.num_gpus and workers is None):
-            return False
-    return True
-
-
-def _in_process(
-    stack: contextlib.ExitStack, config: EvalConfig, parts: Mapping[str, Deployment]
-) -> tuple[EvalConfig, Agents]:
-    """Return the evaluation without workers, and the agents of its policies that are not at a URL."""
-    policies, agents, gpus = [], {}, 0.0
-    for policy in config.policies:
-        if (part := parts.get(str(policy.url).removeprefix("serve://"))) is not None:
-            app = only_application(policy.name, part)
-            args = ServerArgs(**app.args)
-            agents[policy.name], gpus = partial(LocalPolicy, args, own_settings(app)), gpus + args.resources.num_gpus
-        policies.append(policy if part is None else policy.model_copy(update={"url": None}))
-    # As in workers and replicas, for the same results.
-    hidden = {} if gpus else {VISIBLE: ""}
-    stack.enter_context(variables(dict.fromkeys(THREAD_VARIABLES, str(config.worker.threads)) | hidden))
-    return config.model_copy(update={"policies": policies, "workers": 0}), agents
+            return None
+        found[name] = partial(LocalPolicy, args, own_settings(app))
+    return found
 
 
 def resolve_policies(config: EvalConfig, *, ask: bool = True) -> tuple[EvalConfig, dict[str, Deployment]]:
