@@ -62,7 +62,8 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
         (tmp_path / f"w-{step}.txt").write_text(str(length))
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("PYTHONPATH", PYTHONPATH)
-    monkeypatch.delenv("RAY_ADDRESS", raising=False)
+    for name in ("RAY_ADDRESS", "PYTHONBREAKPOINT"):  # Ray sets the latter in a process that connects
+        monkeypatch.delenv(name, raising=False)
     return tmp_path
 
 

@@ -37,13 +37,6 @@ class HttpSettings(BaseModel, extra="allow"):
     port: int = DEFAULT_PORT
 
 
-class DeploymentSettings(BaseModel, extra="allow"):
-    """The settings of one deployment of an application, beside `args`."""
-
-    name: str
-    user_config: Any = None
-
-
 class Application(BaseModel, extra="allow"):
     """An application, of this package or another one."""
 
@@ -52,7 +45,7 @@ class Application(BaseModel, extra="allow"):
     import_path: str
     args: dict[str, Any] = {}
     runtime_env: dict[str, Any] = {}
-    deployments: list[DeploymentSettings] = []
+    deployments: list[dict[str, Any]] = []  # settings of Serve, and `user_config`, by `name`
 
 
 class Deployment(BaseModel, extra="allow"):
@@ -180,7 +173,7 @@ def with_settings(
     changed = config.model_copy(deep=True)
     for app in our_apps(changed):
         app.args["config"] = own_settings(app) | dict(settings)
-        app.deployments = [one for one in app.deployments if one.name != POLICY]
+        app.deployments = [one for one in app.deployments if one.get("name") != POLICY]
         if steps:
             app.args["checkpoints"] = (app.args.get("checkpoints") or {}) | {"steps": True}
     return _checked(changed.model_dump(exclude_unset=True), "settings", step_follows)
@@ -202,8 +195,8 @@ def with_replicas_on(config: Deployment, gpus: float) -> Deployment:
 
 def own_settings(app: Application) -> dict[str, Any]:
     """Return the policy's settings: `config`, and `user_config`, which may change while the policy runs."""
-    beside = [one.user_config for one in app.deployments if one.name == POLICY and isinstance(one.user_config, dict)]
-    return {**app.args.get("config", {}), **(beside[0] if beside else {})}
+    beside = next((one.get("user_config") for one in app.deployments if one.get("name") == POLICY), None)
+    return {**app.args.get("config", {}), **(beside or {})}
 
 
 def stated_contract(config: Deployment) -> Contract | None:
@@ -258,7 +251,7 @@ def _runtime_envs(config: Deployment) -> Iterator[Mapping[str, Any]]:
     for app in config.applications:
         yield app.runtime_env
         for one in app.deployments:
-            yield ((one.model_extra or {}).get("ray_actor_options") or {}).get("runtime_env") or {}
+            yield (one.get("ray_actor_options") or {}).get("runtime_env") or {}
 
 
 def _require_policy(args: ServerArgs, own: dict[str, Any], *, installed: bool, step_follows: bool) -> None:
