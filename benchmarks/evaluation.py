@@ -42,7 +42,7 @@ from vlagents_ray.cli.console import errors, out, progress, table
 from vlagents_ray.cli.options import parse_list
 from vlagents_ray.errors import ConfigError
 from vlagents_ray.evaluate.results.summary import FILE as SUMMARY
-from vlagents_ray.evaluate.workers.cluster import THREAD_VARIABLES
+from vlagents_ray.evaluate.workers.rollout import THREAD_VARIABLES
 from vlagents_ray.serve.ports import LOOPBACK, free_block
 
 OURS = "vlagents-ray"
@@ -56,14 +56,14 @@ class EvaluationPlan:
     """The episodes that all systems play."""
 
     episodes: int = 200  # in all
-    workers: int = 2
+    workers: int = 2  # 0: `vlagents-ray eval` plays in its own process
     rounds: int = 3
     size: int = 224  # pixels a side
     max_steps: int = 80  # nothing else ends an episode
     step_ms: float = 0.0  # additional CPU time of each env step
 
     def __post_init__(self) -> None:
-        if self.episodes % self.workers:
+        if self.episodes % max(1, self.workers):
             raise ConfigError(f"episodes: got {self.episodes}, want a multiple of the {self.workers} workers")
 
     def env(self, notes: Path) -> dict[str, Any]:
@@ -76,6 +76,7 @@ class Played(NamedTuple):
 
     episodes_per_minute: float  # from the first reset to the last step
     wall_s: float  # of the whole command
+    first_s: float | None = None  # from the start of the command to the first reset
     env_busy: float | None = None  # share of the workers' time, of ours alone
     policy_busy: float | None = None  # share of the replica's time, of ours alone
 
@@ -98,7 +99,7 @@ def measure_evaluation(
     scripts = {way.peer: SCRIPTS / way.script for way in found}
     rounds: dict[str, list[Played]] = {}
     with tempfile.TemporaryDirectory() as top:
-        runs = {OURS: _ours(plan)} | their_runs(plan, scripts, peers_python, alone(Path(top)))
+        runs = {OURS: our_run(plan)} | their_runs(plan, scripts, peers_python, alone(Path(top)))
         for number in range(plan.rounds):
             for name, run in runs.items():
                 folder = Path(top) / f"{name} {number}"
@@ -122,9 +123,9 @@ def play(plan: EvaluationPlan, run: Run, folder: Path) -> Played:
     """Run the plan with one system. Raises `ProcessFailed` if it did not play exactly those episodes."""
     notes = folder / "notes"
     notes.mkdir(parents=True)
-    begun = time.monotonic()
+    begun = time.time()  # the clock of the notes
     run(folder, notes)
-    wall_s = time.monotonic() - begun
+    wall_s = time.time() - begun
     episodes = [note for each in read_episode_times(notes).values() for note in each]
     seeds, steps = sorted(note.seed for note in episodes), {note.steps for note in episodes}
     if seeds != list(range(plan.episodes)) or steps != {plan.max_steps}:
@@ -132,10 +133,12 @@ def play(plan: EvaluationPlan, run: Run, folder: Path) -> Played:
             f"{folder.name}: played {len(episodes)} episodes with {len(set(seeds))} seeds and {sorted(steps)} steps, "
             f"want each of {plan.episodes} once with {plan.max_steps}; its results stand for something else"
         )
-    playing_s = max(note.ended for note in episodes) - min(note.begun for note in episodes)
+    first = min(note.begun for note in episodes)
+    playing_s = max(note.ended for note in episodes) - first
     summary = folder / "results" / SUMMARY
     found = json.loads(summary.read_text()) if summary.is_file() else {}
-    return Played(60 * plan.episodes / playing_s, wall_s, found.get("env_busy"), found.get("policy_busy"))
+    busy = found.get("env_busy"), found.get("policy_busy")
+    return Played(60 * plan.episodes / playing_s, wall_s, first - begun, *busy)
 
 
 def ratios(ours: Sequence[Played], theirs: Sequence[Played]) -> dict[str, Any]:
@@ -160,7 +163,9 @@ def alone(folder: Path) -> dict[str, str]:
     return {"PYTHONPATH": f"{place}{os.pathsep}{SCRIPTS}"} | dict.fromkeys(THREAD_VARIABLES, "1")
 
 
-def _ours(plan: EvaluationPlan) -> Run:
+def our_run(plan: EvaluationPlan) -> Run:
+    """Return the run of `vlagents-ray eval`, which serves the policy or, without workers, plays it itself."""
+
     def run(folder: Path, notes: Path) -> None:
         settings = [f"--env-set={name}={value}" for name, value in plan.env(notes).items()]
         command = [
@@ -201,8 +206,8 @@ def their_runs(
 
 
 def _median(rounds: Sequence[Played]) -> Played:
-    rates, walls, *busy = zip(*rounds, strict=True)
-    known = (None if None in shares else statistics.median(shares) for shares in busy)
+    rates, walls, *others = zip(*rounds, strict=True)
+    known = (None if None in column else statistics.median(column) for column in others)
     return Played(statistics.median(rates), statistics.median(walls), *known)
 
 

@@ -125,8 +125,8 @@ def measure_live(
             "holding": deployment("benchmarks.live:Measured", config=_CONFIG, live={"folder": folder}),
         }
         apps = [one.applications[0] for one in made.values()]
-        for name, app in zip(made, apps, strict=True):
-            app.name, app.route_prefix = name, f"/{name}"
+        for name, one in zip(made, apps, strict=True):
+            one.name, one.route_prefix = name, f"/{name}"
         server = stack.enter_context(running_server(made["tapped"].model_copy(update={"applications": apps})))
         fleets = {app.name: Robots(stack, app.name, server.apps[app.name], transport) for app in apps}
         watching = [

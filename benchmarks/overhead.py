@@ -33,7 +33,7 @@ from vlagents_ray.cli.options import parse_settings
 from vlagents_ray.envs import make_env
 from vlagents_ray.errors import EnvFailed
 from vlagents_ray.evaluate import EvalConfig, PolicyConfig, SuiteConfig, evaluate
-from vlagents_ray.evaluate.workers.cluster import THREAD_VARIABLES
+from vlagents_ray.evaluate.workers.rollout import THREAD_VARIABLES
 from vlagents_ray.interface import Act
 from vlagents_ray.ray_tools.reaper import MARK, marked
 from vlagents_ray.serve.launch.deployment_file import deployment

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -15,6 +16,7 @@ from benchmarks.evaluation import (
     EvaluationPlan,
     Played,
     alone,
+    our_run,
     play,
     ratios,
     their_runs,
@@ -84,6 +86,13 @@ def test_ours_says_how_busy_both_sides_were(tmp_path: Path) -> None:
 
     played = play(FEW, run, tmp_path / "fake")
     assert (played.env_busy, played.policy_busy) == (0.75, 0.5)
+
+
+def test_ours_without_workers_plays_the_plan_soon_after_its_start(tmp_path: Path) -> None:
+    alone_here = replace(FEW, workers=0)
+    played = play(alone_here, our_run(alone_here), tmp_path / "here")
+    assert played.first_s is not None
+    assert 0 < played.first_s < played.wall_s
 
 
 @pytest.mark.parametrize(("seeds", "steps"), [(range(3), 3), (range(1, 5), 3), (range(4), 2)])

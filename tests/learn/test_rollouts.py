@@ -16,7 +16,7 @@ from vlagents_ray.evaluate.episode.failures import Failure
 from vlagents_ray.evaluate.plan.cases import cells
 from vlagents_ray.evaluate.plan.jobs import Job, plan
 from vlagents_ray.evaluate.workers import rollout
-from vlagents_ray.evaluate.workers.pool import InProcessWorkers
+from vlagents_ray.evaluate.workers.base import InProcessWorkers
 from vlagents_ray.evaluate.workers.rollout import Report
 from vlagents_ray.interface import Act, Agent, Obs
 from vlagents_ray.learn import RolloutPlan, Rollouts, arrays, rollouts

@@ -23,8 +23,9 @@ from vlagents_ray.evaluate.episode.second_pass import SecondPass
 from vlagents_ray.evaluate.plan.cases import cells, require_envs
 from vlagents_ray.evaluate.plan.config import EpisodeChoice, EvalConfig
 from vlagents_ray.evaluate.plan.jobs import EpisodeKey, Job, JobQueue
+from vlagents_ray.evaluate.workers.base import FailedAttempts, Workers, dispatch
 from vlagents_ray.evaluate.workers.cluster import ray_cluster
-from vlagents_ray.evaluate.workers.pool import FailedAttempts, WorkerPool, Workers, dispatch
+from vlagents_ray.evaluate.workers.pool import WorkerPool
 from vlagents_ray.evaluate.workers.rollout import Report, agents
 from vlagents_ray.interface import BEHAVIOUR, WANT, Act, Agent, Obs
 from vlagents_ray.learn.columns import EXTRA, FINAL, REPLAY, at_rows, tensors

@@ -18,8 +18,9 @@ from vlagents_ray.evaluate.episode.failures import Failure
 from vlagents_ray.evaluate.plan.cases import cells
 from vlagents_ray.evaluate.plan.jobs import EpisodeKey, Job, plan
 from vlagents_ray.evaluate.workers import pool
+from vlagents_ray.evaluate.workers.base import WorkerHandle
 from vlagents_ray.evaluate.workers.cluster import CapacityMonitor
-from vlagents_ray.evaluate.workers.pool import WorkerHandle, WorkerPool
+from vlagents_ray.evaluate.workers.pool import WorkerPool
 from vlagents_ray.evaluate.workers.rollout import Report
 
 pytestmark = pytest.mark.usefixtures("shared_ray")
