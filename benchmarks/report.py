@@ -106,7 +106,7 @@ def evaluation_outcomes(found: Results) -> list[Outcome]:
     cores = min(found["cores"], workers)
     simulator = found["plan"].get("name", "tabletop") != "tabletop"  # its steps take most of the time
     limits = {"vlagents": float(cores), "vlagents, split": 1.0, "vla-eval": LIMIT_VLA_EVAL, "lerobot": float(cores)}
-    limits |= {"vla-eval": 1.0} if simulator else {}
+    limits |= {"vla-eval": 1.0, "lerobot": 1.0} if simulator else {}
     names = {
         "vlagents": "vlagents run-eval, one process",
         "vlagents, split": f"vlagents run-eval, {workers} processes and servers",
