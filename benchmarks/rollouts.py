@@ -159,7 +159,8 @@ def _row(plan: RolloutComparison, policy: str, envs: int, progress: Callable[[st
 
 
 def _made(name: str, config: Mapping[str, Any]) -> Agent:
-    return policy_class(name).from_config(config)
+    agent: Agent = policy_class(name).from_config(config)
+    return agent
 
 
 @contextlib.contextmanager

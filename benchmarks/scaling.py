@@ -177,7 +177,7 @@ def row(
     the sleeps alone allow.
     """
     rates = [one.rate for one in played]
-    known = all(one.sent_bytes is not None for one in played)
+    sent = [one.sent_bytes / one.acts for one in played if one.sent_bytes is not None]
     linear = [workers * each for each in single] if app != CHUNKS else [plan.ideal(workers, app)] * len(rates)
     return {
         "app": app,
@@ -189,7 +189,7 @@ def row(
         "failures": sum(one.failures for one in played),
         "transports": sorted({way for one in played for way in one.transports}),
         "near": min(one.near for one in played),
-        "sent_bytes_per_act": statistics.median(one.sent_bytes / one.acts for one in played) if known else None,
+        "sent_bytes_per_act": statistics.median(sent) if sent else None,
         "driver_share": statistics.median(one.driver_s / one.span_s for one in played),
         "daemon_shares": {
             name: statistics.median(one.daemons_s[name] / one.span_s for one in played) for name in played[0].daemons_s

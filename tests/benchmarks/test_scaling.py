@@ -106,7 +106,7 @@ def test_the_part_with_the_least_room_saturates_first() -> None:
     load = Load(workers=1000, steps=100, episode_s=30.0, chunk=10, act_ms=60.0, batch=10, replicas=2, mbit=100.0)
     rows = parts(SCALING, load)
     found = {row["name"]: row["saturates"] for row in rows}
-    assert list(found)[0] == "learner's link"
+    assert next(iter(found)) == "learner's link"
     # 250 of the workers are queried each second: 10 + 250 ms; an episode takes 3 ms every 30 s.
     assert found["driver"] == pytest.approx(740 / 0.1)
     assert found["database"] == pytest.approx(200 * 30)
