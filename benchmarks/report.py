@@ -117,11 +117,14 @@ def evaluation_outcomes(found: Results) -> list[Outcome]:
     """Return the targets of `benchmarks.evaluation`."""
     workers = found["plan"]["workers"]
     cores = min(found["cores"], workers)
-    limits = {"vlagents": float(cores), "vlagents, split": 1.0, "vla-eval": LIMIT_VLA_EVAL}
+    simulator = found["plan"].get("name", "tabletop") != "tabletop"  # its steps take most of the time
+    limits = {"vlagents": float(cores), "vlagents, split": 1.0, "vla-eval": LIMIT_VLA_EVAL, "lerobot": float(cores)}
+    limits |= {"vla-eval": 1.0, "lerobot": 1.0} if simulator else {}
     names = {
         "vlagents": "vlagents run-eval, one process",
         "vlagents, split": f"vlagents run-eval, {workers} processes and servers",
         "vla-eval": f"vla-eval, {workers} shards",
+        "lerobot": f"lerobot-eval, {workers} environments in one process",
     }
     return [
         Outcome(

@@ -40,30 +40,32 @@ class VlaEvalPolicy(PredictModelServer):
         return [{"actions": action} for action in self._policy(len(obs_batch))]
 
 
-class VlaEvalTabletop(StepBenchmark):
+class VlaEvalTimed(StepBenchmark):
     """The environment that all systems play; each shard imports it by name."""
 
     def __init__(self, seed: int, env: dict[str, Any]) -> None:
-        from benchmarks.environments import TimedTabletop
+        from benchmarks.environments import TimedEnv
         from vlagents_ray.interface import Act
 
         super().__init__()
         set_image_format("raw")
         self._seed = seed
-        self._env, self._act = TimedTabletop(**env), Act
+        self._env, self._act = TimedEnv(**env), Act
 
     def get_tasks(self) -> list[dict[str, Any]]:
-        return [{"name": "tabletop"}]
+        return [{"name": "timed"}]
 
     def reset(self, task: dict[str, Any]) -> Any:
         return self._env.reset(seed=self._seed + task["episode_idx"])[0]
 
     def step(self, action: dict[str, Any]) -> StepResult:
-        obs, reward, terminated, truncated, info = self._env.step(self._act(action["actions"][:4]))
+        obs, reward, terminated, truncated, info = self._env.step(
+            self._act(action["actions"][: self._env.contract.action.dim])
+        )
         return StepResult(obs, reward, terminated or truncated, info)
 
     def make_obs(self, raw_obs: Any, task: dict[str, Any]) -> dict[str, Any]:
-        state = np.append(raw_obs.state["xyzrpy"], np.float32(raw_obs.gripper))
+        state = np.concatenate(list(raw_obs.state.values()))
         return {"images": raw_obs.cameras, "task_description": self._env.instruction, "state": state}
 
     def get_step_result(self, step_result: StepResult) -> dict[str, Any]:
@@ -91,7 +93,7 @@ def evaluate(host: str, port: int, plan: dict[str, Any]) -> None:
     """Start the server, play the shards, and export their results."""
     folder = Path(plan["folder"])
     benchmark = {
-        "benchmark": "vla_eval_peer:VlaEvalTabletop",
+        "benchmark": "vla_eval_peer:VlaEvalTimed",
         "episodes_per_task": plan["episodes"],
         "max_steps": plan["env"]["max_steps"],
         "params": {"seed": plan["seed"], "env": plan["env"]},

@@ -46,10 +46,10 @@ class VlagentsTabletop(EvalEnv):
     """The environment that all systems play."""
 
     def do_import(self) -> None:
-        from benchmarks.environments import TimedTabletop
+        from benchmarks.environments import TimedEnv
         from vlagents_ray.interface import Act
 
-        self._make, self._act = TimedTabletop, Act
+        self._make, self._act = TimedEnv, Act
 
     def make_gym(self) -> Any:
         return self._make(**self.env_kwargs)

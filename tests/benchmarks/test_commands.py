@@ -8,7 +8,20 @@ import pytest
 import typer
 from typer.testing import CliRunner
 
-from benchmarks import autoscaling, evaluation, far_away, growth, hop, policy, report, rtt, scaling, success, throughput
+from benchmarks import (
+    autoscaling,
+    evaluation,
+    far_away,
+    growth,
+    hop,
+    policy,
+    report,
+    rollouts,
+    rtt,
+    scaling,
+    success,
+    throughput,
+)
 from benchmarks.checkpoints import __main__ as checkpoints
 
 
@@ -30,6 +43,7 @@ from benchmarks.checkpoints import __main__ as checkpoints
         (policy, ["noop", "--state", "joints=some"], "joints"),
         (policy, ["noop", "--set", "colour=blue"], "colour"),
         (policy, ["nowhere.yaml"], "nowhere.yaml"),
+        (rollouts, ["--envs", "15"], "multiples of the 2 workers"),
         (rtt, ["--peers", "nobody"], "nobody"),
         (rtt, ["--transports", "smoke"], "smoke"),
         (scaling, ["--workers", "2,4"], "from 1 on"),

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from peer_environment import peers_python
 
-from benchmarks.environments import TIMED_TABLETOP, EpisodeTimes, read_episode_times
+from benchmarks.environments import TIMED_ENV, EpisodeTimes, read_episode_times
 from benchmarks.evaluation import (
     SPLIT,
     EvaluationPlan,
@@ -32,7 +32,7 @@ FEW = EvaluationPlan(episodes=4, workers=2, size=32, max_steps=3)
 
 
 def play_here(notes: Path, seeds: range, steps: int = FEW.max_steps) -> None:
-    with make_env(TIMED_TABLETOP, **FEW.env(notes) | {"max_steps": steps}) as env:
+    with make_env(TIMED_ENV, **FEW.env(notes) | {"max_steps": steps}) as env:
         for seed in seeds:
             env.reset(seed=seed)
             while not env.step(Act(np.zeros(4, np.float32)))[3]:
@@ -40,8 +40,8 @@ def play_here(notes: Path, seeds: range, steps: int = FEW.max_steps) -> None:
 
 
 def test_the_noted_tabletop_is_the_tabletop(tmp_path: Path) -> None:
-    with make_env(TIMED_TABLETOP, **FEW.env(tmp_path)) as noted, make_env("tabletop", width=32, height=32) as plain:
-        assert noted.contract == plain.contract == known_contract(TIMED_TABLETOP, FEW.env(tmp_path))
+    with make_env(TIMED_ENV, **FEW.env(tmp_path)) as noted, make_env("tabletop", width=32, height=32) as plain:
+        assert noted.contract == plain.contract == known_contract(TIMED_ENV, FEW.env(tmp_path))
         ours, theirs = noted.reset(seed=5)[0], plain.reset(seed=5)[0]
         assert np.array_equal(ours.cameras["front"], theirs.cameras["front"])
 
@@ -60,7 +60,7 @@ def test_a_slow_simulator_is_cpu_time(tmp_path: Path) -> None:
     """Not the clock's: that runs on while another process has the core."""
     import time
 
-    with make_env(TIMED_TABLETOP, **FEW.env(tmp_path) | {"step_ms": 20.0}) as env:
+    with make_env(TIMED_ENV, **FEW.env(tmp_path) | {"step_ms": 20.0}) as env:
         env.reset(seed=0)
         used = time.thread_time()
         env.step(Act(np.zeros(4, np.float32)))

@@ -13,7 +13,7 @@ from benchmarks.bare_policy import BarePolicy
 from benchmarks.closed_loop import ClosedLoop
 from benchmarks.figures import mean_interval
 from benchmarks.push import measure_push
-from benchmarks.rollouts import main
+from benchmarks.rollouts import LOCAL, OURS, RolloutComparison, compare_rollouts, rollout_outcomes
 from benchmarks.throughput import ThroughputPlan
 from vlagents_ray.bench.measured_policy import rate_of
 
@@ -118,8 +118,22 @@ def test_the_sessions_act_on_with_the_weights_of_each_push() -> None:
 @pytest.mark.slow
 @pytest.mark.integration
 @pytest.mark.server
-def test_it_measures_both(capsys: pytest.CaptureFixture[str]) -> None:
-    main("tiny", workers=2, num_envs=2, episodes=8, rounds=1, size=32)
-    loop, median = capsys.readouterr().out.splitlines()[-2:]
-    assert loop.startswith("loop ")
-    assert median.startswith("median ")
+def test_rollouts_and_the_loop_play_in_turns() -> None:
+    found = compare_rollouts(RolloutComparison(("tiny",), (1, 4), episodes=8, rounds=1, size=32))
+    one, four = found["rows"]
+    assert (one["workers"], four["workers"]) == (1, 2)
+    assert set(one["of_loop"]) == {OURS, LOCAL}
+    assert set(four["of_loop"]) == {OURS}
+    assert all(rate > 0 for row in found["rows"] for rate in row["rounds"][0].values())
+    assert len(rollout_outcomes(found)) == 2
+
+
+def test_a_slow_policy_wants_the_whole_rate_of_the_loop() -> None:
+    rows = [{"policy": policy, "envs": 16, "of_loop": {OURS: 0.95}} for policy in ("tiny", "slow")]
+    assert [one.met for one in rollout_outcomes({"rows": rows})] == [True, False]
+
+
+def test_each_environment_plays_as_many_episodes() -> None:
+    plan = RolloutComparison(episodes=20)
+    assert [plan.turn("tiny", envs) for envs in (1, 16, 64)] == [20, 32, 64]
+    assert plan.turn("slow", 1) == 5

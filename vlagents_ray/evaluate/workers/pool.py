@@ -27,7 +27,8 @@ from vlagents_ray.evaluate.workers.cluster import CapacityMonitor, Placement, ru
 from vlagents_ray.evaluate.workers.rollout import AgentFactory, Heartbeat, Report, Rollout
 from vlagents_ray.ray_tools.head_monitor import HeadMonitor
 
-WATCH_S = 1.0  # s between two queries of a busy worker
+WATCH_S = 1.0  # s between two queries of a busy worker, unless there are many
+QUERIES_PER_S = 250  # of all workers, at most: each takes the driver up to 1 ms
 GRACE_S = 5.0  # s that a call past its deadline has to fail by itself
 KILL_S = 3.0  # s for Ray to register that workers are to be killed
 CLOSE_S = 10.0  # s for workers to close their simulators when they end
@@ -208,7 +209,7 @@ class WorkerPool(Workers):
                     self._kill_worker(worker)
                     failure = self._with_log(Failure("worker", EnvFailed.code, reason, worker.heartbeat.stack), worker)
                     yield from ((job, Report(failure=failure)) for job in worker.jobs)
-                elif worker.query is None and now - worker.queried_at > WATCH_S:
+                elif worker.query is None and now - worker.queried_at > watch_s(len(self._workers)):
                     worker.queried_at = now
                     worker.query = worker.actor.progress.options(concurrency_group="watch").remote()
 
@@ -222,7 +223,7 @@ class WorkerPool(Workers):
             )
         # A simulator that hangs in C code holds the interpreter's lock, so that no call is answered.
         silent_s = now - worker.heartbeat_at
-        if silent_s > max(limit_s, env_s) + GRACE_S + WATCH_S:
+        if silent_s > max(limit_s, env_s) + GRACE_S + watch_s(len(self._workers)):
             return f"no sign of life for {silent_s:.0f} s, last seen in {heartbeat.phase}; the worker was killed"
         return None
 
@@ -236,6 +237,11 @@ class WorkerPool(Workers):
         except TimeoutError:
             self._unreachable[host] = monotonic() + UNREACHABLE_S
             return failure
+
+
+def watch_s(workers: int) -> float:
+    """Return the time between two queries of one of so many workers, s."""
+    return max(WATCH_S, workers / QUERIES_PER_S)
 
 
 def _kill(actors: list[Any]) -> None:
