@@ -2,7 +2,7 @@
 
 The loop is a learner's first program: it steps environments one after another, calls the policy once for all, and
 collects arrays. `Rollouts` steps as many environments in workers, with a server whose batches may hold all of them. One
-environment also has the policy in its worker's own process. With `--torchrl`, TorchRL's collector with its inference
+environment is also stepped without workers, in this process. With `--torchrl`, TorchRL's collector with its inference
 server also takes its turns.
 """
 
@@ -41,7 +41,7 @@ _POLICIES: dict[str, tuple[str, dict[str, Any]]] = {
     "tiny": ("benchmarks.rollouts:Tiny", {}),
     "slow": ("noop", {"action_dim": 4, "base_ms": 20, "per_item_ms": 1}),
 }
-LOOP, OURS, LOCAL = "loop", "rollouts", "in the worker"
+LOOP, OURS, LOCAL = "loop", "rollouts", "without Ray"
 _TARGETS = {("tiny", 1): 0.85, ("tiny", 16): 0.9, ("tiny", 64): 0.9}  # of the loop's rate; else 1
 
 
@@ -66,9 +66,10 @@ class Tiny(Agent):
 
 
 def loop(agent: Agent, num_envs: int, episodes: int, options: dict[str, Any], *, images: bool) -> float:
-    """Return the steps a second of `episodes` episodes in this process."""
+    """Return the steps a second of `episodes` episodes in this process, whose arrays are kept until all are played."""
     envs = [Tabletop(**options) for _ in range(num_envs)]
     seeds, steps, begun = itertools.count(), 0, time.perf_counter()
+    collected: list[list[np.ndarray]] = []
     for _ in range(episodes // num_envs):
         seen = [env.reset(seed=next(seeds))[0] for env in envs]
         rows: list[tuple[Any, ...]] = []
@@ -82,8 +83,7 @@ def loop(agent: Agent, num_envs: int, episodes: int, options: dict[str, Any], *,
             ]
             seen = [step[0] for step in done]
             steps += num_envs
-        for column in zip(*rows, strict=True):
-            np.stack(column)
+        collected.append([np.stack(column) for column in zip(*rows, strict=True)])
     return steps / (time.perf_counter() - begun)
 
 
@@ -142,7 +142,7 @@ def _row(plan: RolloutComparison, policy: str, envs: int, progress: Callable[[st
     with contextlib.ExitStack() as stack:
         ways[OURS] = stack.enter_context(served(name, config, plan.patience, **kept, **settings))
         if envs == 1:
-            ways[LOCAL] = stack.enter_context(collecting(make, **kept, **settings))
+            ways[LOCAL] = stack.enter_context(collecting(make, **kept, workers=0, num_envs=1))
         rounds = []
         for number in range(plan.rounds):
             rounds.append({way: rate(episodes) for way, rate in ways.items()})
@@ -179,7 +179,9 @@ def served(policy: str, config: dict[str, Any], patience: float, **settings: Any
 def collecting(policy: str | Callable[[], Agent], **settings: Any) -> Iterator[Callable[[int], float]]:
     """Yield a function that returns the steps a second of n episodes of `Rollouts` with these settings."""
     with Rollouts(RolloutPlan("tabletop", policy, **settings)) as rollouts:
-        rollouts.collect(4 * settings["workers"] * settings["num_envs"])  # workers start, and make their environments
+        rollouts.collect(
+            4 * max(1, settings["workers"]) * settings["num_envs"]
+        )  # workers start, and make their environments
 
         def measure(episodes: int) -> float:
             begun = time.perf_counter()
@@ -203,16 +205,18 @@ def torchrl_rate(layout: str, policy: str, episodes: int, **settings: Any) -> fl
 
 
 def rollout_outcomes(found: Mapping[str, Any]) -> list[Outcome]:
-    """Return the targets: of a tiny policy a share of the loop's rate, of a slow one all of it."""
-    return [
-        Outcome(
-            f"rollouts, {row['envs']} environments, the {row['policy']} policy",
-            f"≥ {(wanted := _TARGETS.get((row['policy'], row['envs']), 1.0)):g} x a loop in one process",
-            f"{row['of_loop'][OURS]:.2f}",
-            row["of_loop"][OURS] >= wanted,
-        )
-        for row in found["rows"]
-    ]
+    """Return the targets: of a tiny policy a share of the loop's rate, of a slow one all of it.
+
+    One environment is judged by its rate without Ray, which is how to play it.
+    """
+    outcomes = []
+    for row in found["rows"]:
+        way = LOCAL if LOCAL in row["of_loop"] else OURS
+        wanted, got = _TARGETS.get((row["policy"], row["envs"]), 1.0), row["of_loop"][way]
+        who = "rollouts" if way == OURS else "rollouts without Ray"
+        name = f"{who}, {row['envs']} environments, the {row['policy']} policy"
+        outcomes.append(Outcome(name, f"≥ {wanted:g} x a loop in one process", f"{got:.2f}", got >= wanted))
+    return outcomes
 
 
 def show_rollouts(found: Mapping[str, Any]) -> None:

@@ -22,8 +22,8 @@ from vlagents_ray.errors import ClusterLost, ConfigError, EnvFailed
 from vlagents_ray.evaluate import EvalConfig, EvaluationInterrupted, Summary, evaluate, run
 from vlagents_ray.evaluate.episode.failures import Failure
 from vlagents_ray.evaluate.plan.jobs import Job
-from vlagents_ray.evaluate.workers import base
-from vlagents_ray.evaluate.workers.base import InProcessWorkers
+from vlagents_ray.evaluate.workers import base, in_process
+from vlagents_ray.evaluate.workers.in_process import InProcessWorkers
 from vlagents_ray.evaluate.workers.rollout import Report
 
 Config = Callable[..., EvalConfig]
@@ -132,7 +132,7 @@ def test_what_a_signal_to_the_whole_group_ends_first_costs_no_attempt(
                 reports = [(job, Report(failure=Failure("worker", EnvFailed.code, "killed"))) for job in waiting]
             yield from reports
 
-    monkeypatch.setattr(run, "InProcessWorkers", EndedFirst)
+    monkeypatch.setattr(in_process, "InProcessWorkers", EndedFirst)
     with pytest.raises(EvaluationInterrupted) as stopped:
         evaluate(config(workers=0), agent_factory=ToZero)
     assert stopped.value.summary.total.episodes == 2
@@ -160,7 +160,7 @@ def test_failures_that_come_together_wait_for_a_signal_once(config: Config, monk
 
     monkeypatch.setattr(threading.Event, "wait", waited)
     monkeypatch.setattr(run, "SIGNAL_S", 0.0123)
-    monkeypatch.setattr(run, "InProcessWorkers", FailsOnce)
+    monkeypatch.setattr(in_process, "InProcessWorkers", FailsOnce)
     summary = evaluate(config(workers=0), agent_factory=ToZero)
     assert summary.total.episodes == 6
     with closing(sqlite3.connect(summary.out / "results.db")) as db:

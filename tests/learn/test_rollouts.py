@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 from eval_fakes import EVERY, LINE, OTHER_LINE, Line, SevenLine, ToZero
-from in_process_evaluation import flat_config, without_ray
+from in_process_evaluation import flat_config
 from in_process_replicas import Replicas
 
 from vlagents_ray.envs.base import BatchEnv, SequentialBatch
@@ -16,7 +16,7 @@ from vlagents_ray.evaluate.episode.failures import Failure
 from vlagents_ray.evaluate.plan.cases import cells
 from vlagents_ray.evaluate.plan.jobs import Job, plan
 from vlagents_ray.evaluate.workers import rollout
-from vlagents_ray.evaluate.workers.base import InProcessWorkers
+from vlagents_ray.evaluate.workers.in_process import InProcessWorkers
 from vlagents_ray.evaluate.workers.rollout import Report
 from vlagents_ray.interface import Act, Agent, Obs
 from vlagents_ray.learn import RolloutPlan, Rollouts, arrays, rollouts
@@ -52,13 +52,13 @@ class Workers(InProcessWorkers):
 
 
 @pytest.fixture(autouse=True)
-def pool(monkeypatch: pytest.MonkeyPatch) -> Iterator[type[Workers]]:
+def pool(monkeypatch: pytest.MonkeyPatch) -> type[Workers]:
     """Workers in this process."""
     monkeypatch.setattr(Workers, "dying", 0)
     monkeypatch.setattr(Workers, "played", [])
     monkeypatch.setattr(rollout, "FIRST_WAIT_S", 0.001)
-    with without_ray(rollouts, Workers):
-        yield Workers
+    monkeypatch.setattr(rollouts, "workers_class", lambda _config, _stack: Workers)
+    return Workers
 
 
 class Versioned(ToZero):

@@ -25,7 +25,8 @@ from vlagents_ray.evaluate.results.statistics import Stopping
 from vlagents_ray.evaluate.results.store import Store
 from vlagents_ray.evaluate.results.summary import Summary, summarize, write_summary
 from vlagents_ray.evaluate.trackers import TrackerFeed
-from vlagents_ray.evaluate.workers.base import FailedAttempts, InProcessWorkers, Workers, chosen_workers, dispatch
+from vlagents_ray.evaluate.workers.base import FailedAttempts, Workers, chosen_workers, dispatch
+from vlagents_ray.evaluate.workers.in_process import workers_class
 from vlagents_ray.evaluate.workers.rollout import AgentFactory, OwnAgents, Report, agents, factory_program
 from vlagents_ray.ray_tools.signals import stop_signals
 
@@ -182,7 +183,7 @@ class _Run:
         if not len(self._queue):
             return "complete", conclude(self.config, self.store, "complete")
         with contextlib.ExitStack() as stack:
-            pool_of = self._pool_class(stack)
+            pool_of = workers_class(self.config, stack)
             stop = stack.enter_context(stop_signals())
             self.progress.begin(self.store.cells, self._recorded, len(self._queue))
             try:
@@ -204,15 +205,6 @@ class _Run:
                     return state, conclude(self.config, self.store, state)
             finally:
                 self.progress.end()
-
-    def _pool_class(self, stack: contextlib.ExitStack) -> Callable[[EvalConfig, AgentFactory], Workers]:
-        """Return the class of the workers, in a cluster that `stack` leaves if they are Ray actors."""
-        if not self.config.workers:
-            return InProcessWorkers
-        from vlagents_ray.evaluate.workers import cluster, pool
-
-        stack.enter_context(cluster.ray_cluster(self.config))
-        return pool.WorkerPool
 
     def _poll_pool(self, pool: Workers, stop: threading.Event) -> None:
         if self._deadline.leaves_room:

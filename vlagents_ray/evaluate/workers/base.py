@@ -1,10 +1,8 @@
-"""The workers that play episodes: their interface and number, the dispatch of jobs, and the one without Ray."""
+"""The workers that play episodes: their interface and number, and the dispatch of jobs."""
 
 from __future__ import annotations
 
 import contextlib
-import functools
-import logging
 import os
 from abc import abstractmethod
 from collections import Counter
@@ -12,20 +10,17 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from typing import Any
 
-from vlagents_ray.errors import ConfigError, PolicyFailed, VLAgentsError, from_code
-from vlagents_ray.evaluate.artifacts.recorder import RecorderFactory, Recording
+from vlagents_ray.errors import ConfigError, PolicyFailed, from_code
 from vlagents_ray.evaluate.episode.failures import Failure
 from vlagents_ray.evaluate.plan.cases import EvalCase, cells
 from vlagents_ray.evaluate.plan.config import EvalConfig, WorkerConfig
 from vlagents_ray.evaluate.plan.jobs import Job, JobQueue
-from vlagents_ray.evaluate.workers.rollout import AgentFactory, Heartbeat, Report, Rollout
+from vlagents_ray.evaluate.workers.rollout import Heartbeat, Report
 from vlagents_ray.ray_tools.private import node_of_this_process
-from vlagents_ray.ray_tools.session import variables
 
 SHORT_STEPS = 10_000  # planned steps up to which Ray's start, some seconds, is a large part of the time
 _STEPS = 300  # of an episode, if the options of its environment name no `max_steps`
-_VARIABLES = "env_vars"  # in Ray's runtime environment
-log = logging.getLogger(__name__)
+VARIABLES = "env_vars"  # in Ray's runtime environment
 
 
 def chosen_workers(config: EvalConfig) -> int:
@@ -40,7 +35,7 @@ def chosen_workers(config: EvalConfig) -> int:
     """
     planned, urls = cells(config), [url for one in config.policies for url in (one.url, one.source) if url]
     needs = [f"{url} is inside a Ray cluster" for url in urls if url.startswith("serve://")]
-    packages = {name for cell in planned for name in cell.worker.runtime_env} - {_VARIABLES}
+    packages = {name for cell in planned for name in cell.worker.runtime_env} - {VARIABLES}
     needs += [f"a worker's runtime_env has {name!r}" for name in sorted(packages)]
     if config.workers == 0 and needs:
         raise ConfigError(f"workers: got 0, which plays in this process without Ray, but {needs[0]}; want 1 or more")
@@ -157,50 +152,3 @@ class FailedAttempts:
             raise from_code(
                 failure.code, f"{self._lost} episodes in a row lost to infrastructure; {cure}: {failure.message}"
             )
-
-
-class InProcessWorkers(Workers):
-    """One worker, which plays while it is waited for. No time limit can end a simulator that hangs."""
-
-    def __init__(self, config: EvalConfig, agent_factory: AgentFactory, recorders: RecorderFactory = Recording) -> None:
-        super().__init__()
-        self._make = functools.partial(Rollout, config, agent_factory, recorders)
-        self._rollout = self._make()
-        self._variables = contextlib.ExitStack()
-
-    def __exit__(self, *_: object) -> None:
-        self.close()
-        self._variables.close()
-
-    def free_slot(self) -> bool:
-        for worker in self.idle():
-            self._workers.remove(worker)
-        return not self._workers
-
-    def start(self, cell: EvalCase) -> None:
-        self._variables.enter_context(variables(cell.worker.runtime_env.get(_VARIABLES) or {}))  # type: ignore[arg-type]
-        self._workers.append(WorkerHandle(cell.worker, cell.kind, actor=None, starting=self, started_at=0.0))
-
-    def dispatch(self, worker: WorkerHandle, jobs: tuple[Job, ...]) -> None:
-        worker.jobs = jobs
-
-    def wait(self, timeout_s: float) -> Iterator[tuple[Job, Report]]:
-        for worker in self._workers:
-            worker.starting = None
-            jobs, worker.jobs = worker.jobs, ()
-            if not jobs:
-                continue
-            reports = self._rollout.run(jobs)
-            if reports[0].env is not None:
-                worker.env_place = jobs[0].cell.place
-            if any(one.failure is not None and one.failure.cause == "worker" for one in reports):
-                self.close()
-                worker.env_place = None
-            yield from zip(jobs, reports, strict=True)
-
-    def close(self) -> None:
-        broken, self._rollout = self._rollout, self._make()
-        try:
-            broken.close()
-        except VLAgentsError as error:
-            log.warning("closing the env: %s", error)
