@@ -1,6 +1,9 @@
 from __future__ import annotations
 
 import itertools
+import os
+import subprocess
+import sys
 from collections.abc import Iterator
 from typing import Any
 
@@ -105,6 +108,25 @@ def test_collect_plays_so_many_and_no_others(pool: type[Workers]) -> None:
         assert table.num_rows == 50
         assert arrays(table)["state.position"].shape == (50, 1)
         assert list(dict.fromkeys(arrays(found.collect(2))["key"])) == planned(7)[5:]
+
+
+PLAY = """
+import sys
+for name in ("ray", "torch"):
+    sys.modules[name] = None  # as if it were not installed
+from eval_fakes import LINE, ToZero
+from vlagents_ray.learn import RolloutPlan, Rollouts
+with Rollouts(RolloutPlan(LINE, ToZero, workers=0)) as rollouts:
+    print(rollouts.collect(2).num_rows)
+"""
+
+
+def test_without_workers_they_need_no_ray() -> None:
+    environment = os.environ | {"PYTHONPATH": os.pathsep.join(path for path in sys.path if path)}
+    command = [sys.executable, "-W", "error", "-c", PLAY]
+    told = subprocess.run(command, check=False, capture_output=True, text=True, timeout=60, env=environment)
+    assert told.returncode == 0, told.stderr
+    assert told.stdout.strip() == "20"
 
 
 class Replayed(ToZero):
