@@ -22,11 +22,14 @@ def plot_league(results: Mapping[str, Any], file: Path) -> None:
     matplotlib = require("matplotlib")
     parts = [results[name] for name in ("throughput", "without_gain") if results.get(name)]
     with matplotlib.rc_context(_SETTINGS):
-        figure = require("matplotlib.figure").Figure(figsize=(10, 6), layout="constrained")
+        figure = require("matplotlib.figure").Figure(figsize=(11, 6), layout="constrained")
         axes = figure.subplot_mosaic([[0, index + 1] for index in range(len(parts))] or [[0]])
         _plot_round_trips(axes[0], results["rtt"])
         for index, part in enumerate(parts):
             _plot_throughput(axes[index + 1], part)
+        if parts:
+            handles, labels = axes[1].get_legend_handles_labels()
+            figure.legend(handles, labels, loc="outside right center", fontsize=8, frameon=False, labelcolor=_TEXT)
         figure.savefig(file, transparent=True, metadata={"Date": None})
 
 
@@ -55,8 +58,10 @@ def _plot_throughput(axes: Any, part: Mapping[str, Any]) -> None:
         )  # fmt: skip
     axes.axhline(part["ideal_actions_per_s"], color=_TEXT, lw=0.8)
     axes.set_xscale("log", base=2)
+    counts = [point["clients"] for point in points]  # those of all
+    axes.set_xticks(counts, map(str, counts))
+    axes.set_ylim(0, 1.15 * part["ideal_actions_per_s"])
     settings = "".join(f", {key} {value}" for key, value in part["config"].items())
-    axes.set_title(f"{part['policy']}{settings}, batches of {part['batch']} at most", fontsize=9)
+    axes.set_title(f"{part['policy']}{settings}, batches of {part['batch']} at most", fontsize=8)
     axes.set_xlabel("clients")
     axes.set_ylabel("actions/s")
-    axes.legend(fontsize=7, frameon=False, labelcolor=_TEXT)
