@@ -7,7 +7,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Collection, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 
@@ -84,6 +84,8 @@ class EvalEnv(Environment):
     observation, in any process and after any other episodes.
     """
 
+    known: ClassVar[Collection[str]] = ()  # the names of the tasks, for `tasks`
+
     @property
     @abstractmethod
     def instruction(self) -> str:
@@ -125,7 +127,7 @@ class EvalEnv(Environment):
     @classmethod
     def tasks(cls) -> list[str]:
         """List the known tasks; empty if the simulator accepts any name."""
-        return []
+        return list(cls.known)
 
     @classmethod
     def require_task(cls, task: str | None) -> None:

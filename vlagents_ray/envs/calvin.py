@@ -167,7 +167,7 @@ class Calvin(SimulatorEnv):
     `info["tasks"]` are CALVIN's names of the chain, `info["solved"]` is the number of solved tasks.
     """
 
-    suite = "calvin"
+    suite, known = "calvin", SCENES
     _contract = CONTRACT
     several_tasks = True
     init_states = NUMBER
@@ -215,10 +215,6 @@ class Calvin(SimulatorEnv):
     def instruction(self) -> str:
         """The current task in the words of CALVIN's evaluation."""
         return self._words[self._playing().tasks[min(self._done, TASKS - 1)]]
-
-    @classmethod
-    def tasks(cls) -> list[str]:
-        return list(SCENES)
 
     @classmethod
     def missing(cls) -> str | None:

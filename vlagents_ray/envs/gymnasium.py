@@ -319,16 +319,14 @@ class PushT(Gymnasium):
     Action: (2,) in [0, 512]: the target of the disc, in the same pixels.
     """
 
+    known = tuple(_TASKS)
+
     def __init__(
         self, task: str = "image", *, width: int | None = None, height: int | None = None, max_steps: int | None = None
     ) -> None:
         """Make the environment; images are stretched to `width` and `height`, pixels."""
         self.require_task(task)
         super().__init__(_ID, **_TASKS[task], width=width, height=height, max_steps=max_steps)
-
-    @classmethod
-    def tasks(cls) -> list[str]:
-        return list(_TASKS)
 
     @classmethod
     def require_task(cls, task: str | None) -> None:

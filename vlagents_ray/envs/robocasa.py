@@ -136,7 +136,7 @@ class RoboCasa(RobosuiteEnv):
     gripper, which closes at 0.5 or more and opens below that.
     """
 
-    suite, title = "robocasa", "RoboCasa"
+    suite, title, known = "robocasa", "RoboCasa", tuple(HORIZONS)
     packages = ("robocasa", "robosuite", "mujoco")
     cure = "run `vlagents-ray env make requirements/robocasa.txt` and give the evaluation's workers that Python"
     _raw: Mapping[str, str] = {
@@ -233,10 +233,6 @@ class RoboCasa(RobosuiteEnv):
             ),
             control_hz=CONTROL_HZ,
         )
-
-    @classmethod
-    def tasks(cls) -> list[str]:
-        return list(HORIZONS)
 
     def describe(self) -> dict[str, Any]:
         facts = super().describe() | self._versions

@@ -73,7 +73,7 @@ class Simpler(SimulatorEnv):
     `terminated`.
     """
 
-    suite = "simpler"
+    suite, known = "simpler", tuple(TWINS)
 
     def __init__(
         self,
@@ -136,10 +136,6 @@ class Simpler(SimulatorEnv):
     @property
     def instruction(self) -> str:
         return self._alive().instructions()[0] if self._given_instruction is None else self._given_instruction
-
-    @classmethod
-    def tasks(cls) -> list[str]:
-        return sorted(TWINS)
 
     @classmethod
     def missing(cls) -> str | None:

@@ -51,7 +51,7 @@ class ManiSkill(SimulatorEnv):
     and never reports `terminated`.
     """
 
-    suite = "maniskill"
+    suite, known = "maniskill", tuple(INSTRUCTIONS)
 
     def __init__(
         self,
@@ -109,10 +109,6 @@ class ManiSkill(SimulatorEnv):
         """Begin the episode of `seed`, taken modulo 2^32; `options` are passed to ManiSkill's own reset."""
         self._options = options or {}
         return super().reset(seed=seed)
-
-    @classmethod
-    def tasks(cls) -> list[str]:
-        return sorted(INSTRUCTIONS)
 
     @classmethod
     def require_task(cls, task: str | None) -> None:
