@@ -178,8 +178,7 @@ def replay_command(
                 raise ConfigError(f"{folder}: is a dataset, got {episode!r}; want --episodes, or none of it")
             if policy is None:
                 raise ConfigError(f"{folder}: is a dataset: want --policy, a name, a deployment file or a URL")
-            from vlagents_ray.open_loop import Names
-            from vlagents_ray.open_loop import ReplayPlan
+            from vlagents_ray.open_loop import Names, ReplayPlan
 
             chosen = None if episodes is None else parse_episodes(episodes)
             pairs = [part.partition("=") for part in parse_list(cameras or "")]

@@ -95,7 +95,8 @@ class VlagentsConnection:
                 return rpyc.reference_reply(call.sequence, _number(call.args))
             return rpyc.reply(call.sequence, self._value(call))
         except VLAgentsError as error:
-            return rpyc.exception(call.sequence, _builtin(error), f"{error.code}: {error}")
+            kind = next((one.__name__ for one in (TimeoutError, ValueError) if isinstance(error, one)), "RuntimeError")
+            return rpyc.exception(call.sequence, kind, f"{error.code}: {error}")
         except Exception:  # noqa: BLE001 - logged, and answered
             return rpyc.exception(call.sequence, "RuntimeError", internal_error("vlagents"))
 
@@ -219,12 +220,6 @@ def _called(call: RpycCall) -> tuple[str, tuple[Any, ...]]:
     if any(options):
         raise MalformedMessage(f"{name}: takes no arguments by name")
     return name, args
-
-
-def _builtin(error: VLAgentsError) -> str:
-    if isinstance(error, TimeoutError):
-        return "TimeoutError"
-    return "ValueError" if isinstance(error, ValueError) else "RuntimeError"
 
 
 def _is_same_machine(connection: socket.socket) -> bool:
