@@ -115,9 +115,7 @@ class RerunEpisode:
     """The recording of one episode."""
 
     def __init__(self, rerun: Any, recording: Any, instruction: str, *, live: bool) -> None:
-        self._rerun = rerun
-        self._recording = recording
-        self._live = live
+        self._rerun, self._recording, self._live = rerun, recording, live
         if instruction:
             recording.log("instruction", rerun.TextDocument(instruction), static=True)
 

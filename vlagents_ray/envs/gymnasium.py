@@ -152,9 +152,7 @@ class Gymnasium(EvalEnv):
         self._module = module if module is not None else defaults.module
         self._kwargs = {**defaults.kwargs, **(kwargs or {})}
         self._protocol = defaults.protocol
-        self._success = success
-        self._unit_actions = unit_actions
-        self._remake = remake
+        self._success, self._unit_actions, self._remake = success, unit_actions, remake
         self._ready = False
         self._steps = 0
         self._env = self._make(max_steps)

@@ -52,8 +52,7 @@ class CheckpointWatcher:
         self.folder = Path(*parts[:place]) if folder is None else folder
         self._below = parts[place + 1 :]
         self._name = re.compile(re.escape(parts[place]).replace(re.escape(STEP), r"(\d+)", 1))
-        self._settle_s = settle_s
-        self._marker = marker
+        self._settle_s, self._marker = settle_s, marker
         self._seen: dict[int, _SeenFile] = {}
         self._complete: set[int] = set()
 

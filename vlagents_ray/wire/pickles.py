@@ -95,9 +95,7 @@ class _StackMachine:
     ) -> None:
         self._data = memoryview(data)
         self._at = 0
-        self._limits = limits
-        self._records = records
-        self._calls = calls
+        self._limits, self._records, self._calls = limits, records, calls
         self._items = 0
         self._stack: list[_StackValue] = []
         self._below: list[list[_StackValue]] = []  # the stacks below each open mark

@@ -57,8 +57,7 @@ class HandleTransport:
 
         `must_be_near` accepts only a replica on this machine, even if others have far less load.
         """
-        self._must_be_near = must_be_near
-        self._app = app
+        self._must_be_near, self._app = must_be_near, app
         self._session = uuid.uuid4().hex
         self._replica: Any = None
 

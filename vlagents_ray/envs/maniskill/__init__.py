@@ -169,9 +169,7 @@ class ManiSkillBatch(BatchEnv):
             )
         self.num_envs = num_envs
         self.max_steps, self._own_limit = step_limits(f"maniskill/{task}", task, max_steps)
-        self._task = task
-        self._instruction = instruction
-        self._reconfigure = reconfigure
+        self._task, self._instruction, self._reconfigure = task, instruction, reconfigure
         self._playing = self._steps = 0
         self._simulator = _simulator(task, num_envs=num_envs, sim_backend=sim_backend, **options)
         self._contract = self._simulator.contract(self._simulator.action)

@@ -51,8 +51,7 @@ class TabletopWorld:
     """The state of one episode."""
 
     def __init__(self, pucks: list[Puck], pads: list[Pad]) -> None:
-        self.pucks = pucks
-        self.pads = pads
+        self.pucks, self.pads = pucks, pads
         self.x, self.y, self.z = HOME  # m, midway between the fingertips
         self.gap = GAP_OPEN  # m
         self.held: Puck | None = None

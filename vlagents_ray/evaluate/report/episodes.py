@@ -94,8 +94,7 @@ class Gallery:
     """Chooses which videos the report embeds or links, within a size budget."""
 
     def __init__(self, results: Results, page: Path, *, inline: bool, budget: int = BUDGET) -> None:
-        self._results = results
-        self._page = page
+        self._results, self._page = results, page
         self._budget = budget if inline else 0
         self.inlined = 0
         self.linked = 0

@@ -46,8 +46,7 @@ class WorkerPool(Workers):
 
     def __init__(self, config: EvalConfig, agent_factory: AgentFactory, recorders: RecorderFactory = Recording) -> None:
         super().__init__()
-        self._config = config
-        self._recorders = recorders
+        self._config, self._recorders = config, recorders
         self._actor_class = ray.remote(concurrency_groups={"watch": 1})(Rollout)
         self._agent_factory = agent_factory
         # from this process's environment, which workers on other nodes do not inherit

@@ -88,9 +88,7 @@ class Rollout:
     """Plays jobs. Keeps its agent and its environment until a job needs another."""
 
     def __init__(self, config: EvalConfig, agent_factory: AgentFactory, recorders: RecorderFactory = Recording) -> None:
-        self._config = config
-        self._agent_factory = agent_factory
-        self._recorders = recorders
+        self._config, self._agent_factory, self._recorders = config, agent_factory, recorders
         self._agent: Agent | None = None
         self._policy: str | None = None  # the policy of the agent
         self._described: dict[str, Any] = {}  # of an agent without a server: its weights

@@ -71,8 +71,7 @@ class Statistics:
     """The statistics of all datasets on which a checkpoint was trained, by `unnorm_key`, the name of the dataset."""
 
     def __init__(self, datasets: Mapping[str, Any], bounds: Bounds = "q99") -> None:
-        self._datasets = datasets
-        self.bounds = bounds
+        self._datasets, self.bounds = datasets, bounds
 
     @classmethod
     def of(cls, checkpoint: Path, bounds: Bounds = "q99") -> Statistics:
