@@ -375,8 +375,7 @@ def replay(folder: Path, sessions: Sessions, plan: ReplayPlan) -> OpenLoopResult
         ConfigError: There is no dataset, its actions do not fit the policy's, or a name is unknown.
         PolicyFailed: The policy raised an error, or refused an observation.
     """
-    datasets = [RecordedDataset(root) for root in find_datasets(folder)]
-    if not datasets:
+    if not (datasets := [RecordedDataset(root) for root in find_datasets(folder)]):
         raise ConfigError(f"{folder}: is no LeRobotDataset, and has none in it (meta/info.json)")
     first = datasets[0]
     for other in datasets[1:]:

@@ -280,8 +280,7 @@ class LoopView:
 
     def add(self, obs: Obs, act: Act, executed: np.ndarray | None, tick: int, work_s: float, stop: str = "") -> None:
         """Show a tick with the time that the loop worked, `work_s`, and the reason of a stop; never waits."""
-        viewer = self._viewer
-        if viewer is None:
+        if (viewer := self._viewer) is None:
             return
         if not viewer.has_room:
             viewer.dropped += 1

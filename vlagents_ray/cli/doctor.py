@@ -305,8 +305,7 @@ def judge_library(name: str, driver: str | None, version: str, cuda: str | None,
 
 def triton_compiler(headers: Path) -> Check:
     """Check that Triton finds a C compiler and Python's headers, with which it builds a program that starts kernels."""
-    compiler = os.environ.get("CC") or shutil.which("gcc") or shutil.which("clang")
-    if compiler is None:
+    if (compiler := os.environ.get("CC") or shutil.which("gcc") or shutil.which("clang")) is None:
         return Check("warn", "none, which torch.compile needs on a GPU", "apt-get install gcc libc6-dev")
     if not (headers / "Python.h").exists():
         return Check("warn", f"{compiler}, but no {headers}/Python.h", "apt-get install python3-dev, of this version")

@@ -103,8 +103,7 @@ def _list(listed: Sequence[Listed], name: str | None, *, as_json: bool) -> None:
     """Print a listing: a line for each with installation commands, or the full description of one name."""
     from vlagents_ray.cli.listing import installing
 
-    chosen = [one for one in listed if name in (None, one.name)]
-    if not chosen:
+    if not (chosen := [one for one in listed if name in (None, one.name)]):
         fail(f"{name!r} is not registered{did_you_mean(str(name), [one.name for one in listed])}", 2)
     if as_json:
         out.print(json.dumps([asdict(one) for one in chosen], indent=2, default=str))

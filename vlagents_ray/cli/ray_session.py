@@ -100,8 +100,7 @@ class _Terminal:
     def is_shown(self, record: logging.LogRecord) -> bool:
         """Return whether a record of this process is a problem; for `logging`."""
         text = record.getMessage()
-        shown = _is_problem(text, record.levelno)
-        if not shown:
+        if not (shown := _is_problem(text, record.levelno)):
             self._note(text)
         return shown
 

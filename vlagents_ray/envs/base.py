@@ -318,8 +318,7 @@ def make_batch(name: str, num_envs: int, **options: Any) -> BatchEnv:
     if num_envs < 1:
         raise ConfigError(f"env {name!r}: num_envs is {num_envs}, want at least 1")
     cls, arguments = env_arguments(name, options)
-    together = cls.batched(num_envs, **arguments)
-    if together is not None:
+    if (together := cls.batched(num_envs, **arguments)) is not None:
         return together
     with ExitStack() as made:
         envs = [made.enter_context(cls(**arguments)) for _ in range(num_envs)]
@@ -398,8 +397,7 @@ class SequentialBatch(BatchEnv):
         """
         if len(seen) == 1 or not moved or not self.looked_at:
             return seen
-        shown = seen[min(moved)].cameras
-        if not shown:
+        if not (shown := seen[min(moved)].cameras):
             return seen
         cameras = [obs.cameras if i in moved else {**shown, **obs.cameras} for i, obs in enumerate(seen)]
         images = {name: np.stack([one[name] for one in cameras]) for name in cameras[0]}

@@ -266,8 +266,7 @@ def require_assets(registries: Sequence[str] = REGISTRIES) -> None:
         return
     folder = Path(spec.origin).parent / "models" / "assets"
     wanted = ["textures", "fixtures/stoves", *(f"objects/{name}" for name in registries)]
-    lacks = [part for part in wanted if not (folder / part).is_dir()]
-    if lacks:
+    if lacks := [part for part in wanted if not (folder / part).is_dir()]:
         types = " ".join(TYPES[part] for part in lacks)
         raise EnvFailed(
             f"robocasa: the assets in {folder} lack {lacks}; download them once, about 10 GB, with that environment's "

@@ -189,7 +189,6 @@ def _command(action: np.ndarray) -> np.ndarray:
 
 
 def _missing_assets(folder: Path) -> str | None:
-    lacks = [place for place in _DATA.values() if not (folder / "data" / place).is_dir()]
-    if not lacks:
+    if not (lacks := [place for place in _DATA.values() if not (folder / "data" / place).is_dir()]):
         return None
     return f"SIMPLER's assets are not in {folder} (no data/{lacks[0]}); set MS_ASSET_DIR, or get them: {_DOWNLOADS}"

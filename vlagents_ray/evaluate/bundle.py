@@ -358,8 +358,7 @@ def _check(folder: Path, replay: int, *, trust: bool) -> Iterator[Finding]:
     by_cell = [[(cell, one) for one in cell.episodes if one.result.status == "done"] for cell in results.cells]
     turns = (pair for turn in zip_longest(*by_cell) for pair in turn if pair is not None)
     found = ((*pair, trajectory) for pair in turns if (trajectory := _recorded(results, pair[1])) is not None)
-    chosen = list(islice(found, replay))
-    if not chosen:
+    if not (chosen := list(islice(found, replay))):
         yield Finding("replay", "not checked", "no finished episode has a recording (eval --record all)")
     for cell, episode, trajectory in chosen:
         yield _replay(cell, episode, trajectory, trust=trust)

@@ -106,8 +106,7 @@ class _StackMachine:
             raise MalformedMessage(f"pickle: want one of protocol {_PROTOCOLS[0]} or {_PROTOCOLS[1]}")
         while (opcode := self.take(1)[0]) != _STOP:
             self._count(1)
-            read = _OPCODES.get(opcode)
-            if read is None:
+            if (read := _OPCODES.get(opcode)) is None:
                 raise MalformedMessage(f"pickle: got opcode {opcode:#04x}, which is not read here")
             read(self)
         root = _finished(self.pop())

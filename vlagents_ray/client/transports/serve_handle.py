@@ -226,14 +226,12 @@ class PlasmaTransport(UnixTransport):
 
     def connect_to(self, handle: HandleTransport, metadata: dict[str, Any], timeout_s: float) -> None:
         """Connect like `connect`, but to the replica that `handle` chose and whose metadata is passed."""
-        node = this_node()
-        if node is None:
+        if (node := this_node()) is None:
             raise ConfigError(
                 f"serve://{self._app}: transport 'plasma' needs a process on a node of the cluster; "
                 f"a Ray client (ray://) is none: use http://"
             )
-        address = metadata.get("plasma")
-        if address is None:
+        if (address := metadata.get("plasma")) is None:
             raise ConfigError(f"serve://{self._app}: its replica offers no plasma endpoint; use transport 'handle'")
         if address["node"] != node:
             raise ConfigError(

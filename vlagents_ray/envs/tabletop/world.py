@@ -116,8 +116,7 @@ class TabletopWorld:
                 if abs(a.z - b.z) >= PUCK_HEIGHT - _EPSILON:
                     continue
                 still, loose = (b, a) if b is self.held else (a, b)
-                push = _overlap(loose, still.x, still.y, 2 * PUCK_RADIUS)
-                if push:
+                if push := _overlap(loose, still.x, still.y, 2 * PUCK_RADIUS):
                     loose.x += push[0]
                     loose.y += push[1]
                     moved = True

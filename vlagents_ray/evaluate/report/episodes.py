@@ -115,8 +115,7 @@ class Gallery:
 
     def player(self, video: str, label: str) -> Player | None:
         """Return a player for `video`, a path of an episode; None if the file is missing."""
-        path = self._file(video)
-        if path is None:
+        if (path := self._file(video)) is None:
             return None
         size, frame = path.stat().st_size, last_frame(path)
         if size <= self._budget:
@@ -149,8 +148,7 @@ def episodes(results: Results, gallery: Gallery) -> Episodes | None:
     """Return all episodes, or None without any."""
     order = {name: index for index, name in enumerate(results.contenders)}
     cells = sorted(results.cells, key=lambda cell: order[cell.contender])
-    found = [(cell, one) for cell in cells for one in cell.episodes]
-    if not found:
+    if not (found := [(cell, one) for cell in cells for one in cell.episodes]):
         return None
     solved = [(cell, one) for cell, one in found if one.counts and one.result.success_once]
     cards = gallery.cards(solved, MOST_SOLVED)

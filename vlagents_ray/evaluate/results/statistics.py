@@ -273,8 +273,7 @@ def pooled(counts: Sequence[tuple[int, int]], error_rate: float) -> tuple[float,
     of the error rate: then all their bounds hold at once, and so does any weighted mean.
     """
     counts = [one for one in counts if one[1]]
-    total = sum(trials for _, trials in counts)
-    if not total:
+    if not (total := sum(trials for _, trials in counts)):
         return 0.0, 1.0
     bounds = [(*confidence_sequence(s, n, error_rate / len(counts)), n / total) for s, n in counts]
     return sum(low * share for low, _, share in bounds), sum(high * share for _, high, share in bounds)

@@ -205,8 +205,7 @@ class Rollout:
     def _sessions_of(self, agent: Agent, env: BatchEnv, number: int) -> list[Agent]:
         if env.num_envs == 1:
             return [agent]
-        sessions = getattr(agent, "sessions", None)
-        if sessions is None:
+        if (sessions := getattr(agent, "sessions", None)) is None:
             raise ConfigError("num_envs: got more than 1 for a policy in the worker's own process; give it a `url`")
         if number > len(self._sessions):
             self._sessions += sessions(number - len(self._sessions))
@@ -245,8 +244,7 @@ class Rollout:
                 else:
                     env = make_batch(cell.env, number, **options)
         except EnvFailed as error:
-            reason = env_class(cell.env).missing()
-            if reason is None:
+            if (reason := env_class(cell.env).missing()) is None:
                 raise
             raise MissingDependency(f"env {cell.env!r} cannot run here: {reason}") from error
         self._place = cell.place

@@ -87,8 +87,7 @@ def files_named(settings: Mapping[str, Any], *, folders: bool = True) -> Program
     step = settings.get("checkpoint_step")
     found: Program = {}
     for name, text in _texts(settings):
-        path = _existing(at_step(text, step) if isinstance(step, int) else text)
-        if path is None:
+        if (path := _existing(at_step(text, step) if isinstance(step, int) else text)) is None:
             continue
         if path.is_file():
             found[f"{name}: {path}"] = digest([path])
@@ -156,8 +155,7 @@ def _imports(source: bytes, package: str) -> Iterator[str]:
             yield from (alias.name for alias in node.names)
         elif isinstance(node, ast.ImportFrom):
             parts = package.split(".")[: len(package.split(".")) - node.level + 1] if node.level else []
-            base = ".".join([*parts, *([node.module] if node.module else [])])
-            if base:
+            if base := ".".join([*parts, *([node.module] if node.module else [])]):
                 yield base
                 yield from (f"{base}.{alias.name}" for alias in node.names if alias.name != "*")
 

@@ -484,8 +484,7 @@ class PrismaticPolicy(ModelPolicy):
         return chunks
 
     def _statistics(self, adapter: str = "") -> Statistics:
-        checkpoint = self._checkpoint
-        if checkpoint is None:
+        if (checkpoint := self._checkpoint) is None:
             raise NotReset(f"{type(self).__name__}: not loaded; call initialize() first")
         return checkpoint.own.get(adapter, checkpoint.statistics)
 
@@ -494,8 +493,7 @@ class PrismaticPolicy(ModelPolicy):
         return None if self._statistics(adapter) is not self._statistics() else self.config.unnorm_key
 
     def _named(self, options: Mapping[str, Any], adapter: str) -> str | None:
-        key = options.get(UNNORM_KEY)
-        if key is None:
+        if (key := options.get(UNNORM_KEY)) is None:
             return None
         if not isinstance(key, str):
             raise InvalidObservation(f"unnorm_key: got {type(key).__name__}, want a dataset's name")
