@@ -41,8 +41,7 @@ def report_command(
             return
         results = combined([Results.load(folder) for folder in folders])
         path = html or (folders[0] / FILE if len(folders) == 1 else Path(FILE))
-        written = write_report(results, path, inline=inline)
-        out.print(f"report: {written}")
+        out.print(f"report: {write_report(results, path, inline=inline)}")
 
 
 def export_command(
