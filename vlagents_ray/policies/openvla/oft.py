@@ -120,10 +120,6 @@ class OpenVLAOFT(prismatic.PrismaticPolicy):
         state = None if projector is None else state_vector(obs, self._state, projector.dim)
         return self.model.base.stage(seen), state
 
-    @property
-    def _checkpoint(self) -> prismatic.Prismatic | None:
-        return None if self.model is None else self.model.base
-
     def _model_input(self, row: Row, key: str) -> ModelInput:
         seen, state = row.frames[-1]
         base = self.model.base

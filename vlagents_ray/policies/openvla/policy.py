@@ -71,10 +71,6 @@ class OpenVLA(prismatic.PrismaticPolicy):
             image = prismatic.middle(prismatic.resized(image))
         return self.model.base.stage([image])
 
-    @property
-    def _checkpoint(self) -> prismatic.Prismatic | None:
-        return None if self.model is None else self.model.base
-
     def _model_input(self, row: Row, key: str) -> tuple[StagedRow, list[int]]:
         return row.frames[-1], self.model.base.tokens(row.instruction)
 

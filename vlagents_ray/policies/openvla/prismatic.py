@@ -424,9 +424,10 @@ class PrismaticPolicy(ModelPolicy):
     network = "model.base.network"
 
     @property
-    @abc.abstractmethod
     def _checkpoint(self) -> Prismatic | None:
         """The checkpoint; None before it is loaded."""
+        base: Prismatic | None = None if self.model is None else self.model.base
+        return base
 
     @abc.abstractmethod
     def _model_input(self, row: Row, key: str) -> Any:
