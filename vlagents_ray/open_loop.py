@@ -286,8 +286,7 @@ class ErrorTable:
 
     def add(self, expected: np.ndarray, got: np.ndarray) -> float:
         """Add a frame's chunks, (H, D) each, and return their mean absolute error."""
-        rows = len(expected)
-        if rows > len(self.frames):
+        if (rows := len(expected)) > len(self.frames):
             more = ((0, rows - len(self.frames)), (0, 0))
             self.absolute, self.square, self.largest = (
                 np.pad(one, more) for one in (self.absolute, self.square, self.largest)

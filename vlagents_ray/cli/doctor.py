@@ -150,8 +150,7 @@ def open_files() -> Check:
 
 def judge_open_files(soft: int, hard: int) -> Check:
     """Judge the limits; Ray raises the soft one by itself, up to the hard one or 65536."""
-    effective = max(soft, min(hard, _FILES_RAISED_TO))
-    if effective >= _FILES_ENOUGH:
+    if (effective := max(soft, min(hard, _FILES_RAISED_TO))) >= _FILES_ENOUGH:
         return Check("ok", f"{soft} a process, {effective} under Ray")
     cure = f"ulimit -Hn {_FILES_WANTED} as root, or LimitNOFILE={_FILES_WANTED} in the service's systemd unit"
     return Check("warn", f"{effective} a process; many robots or workers at once may run out", cure)

@@ -359,8 +359,7 @@ class SequentialBatch(BatchEnv):
         return self._seen[index]
 
     def step(self, acts: Sequence[Act | None]) -> Steps:
-        n = len(acts)
-        if n != self._playing:
+        if (n := len(acts)) != self._playing:
             raise ConfigError(f"step: got {n} actions, want {self._playing}, one for each episode or None")
         moving = {i: act for i, act in enumerate(acts) if act is not None}
         if n > 1:  # a single environment checks its action itself

@@ -315,8 +315,7 @@ def find_checkout(chosen: str | None) -> Path:
 
 def make_simulator(checkout: Path, scene: str, renderer: RendererName) -> Any:
     """Make CALVIN's `PlayTableSimEnv` of a scene, with the cameras, arm and rates of its datasets."""
-    folder = str(checkout / _PACKAGE)
-    if folder not in sys.path:
+    if (folder := str(checkout / _PACKAGE)) not in sys.path:
         sys.path.insert(0, folder)
     if device := os.environ.get(EGL_DEVICE):
         os.environ.setdefault("EGL_VISIBLE_DEVICES", device)

@@ -139,8 +139,7 @@ class _StackMachine:
             raise MalformedMessage(f"pickle: a text that is not UTF-8 ({error.reason})") from error
 
     def integer(self) -> None:
-        length = self.take(1)[0]
-        if length > _INTEGER:
+        if (length := self.take(1)[0]) > _INTEGER:
             raise MessageTooLarge(f"pickle: an integer of {length} bytes, the limit is {_INTEGER}")
         self.push(int.from_bytes(self.take(length), "little", signed=True))
 

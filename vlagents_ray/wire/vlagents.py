@@ -204,8 +204,7 @@ def _shared(payload: Mapping[str, Any], budget: Budget, segments: Segments) -> n
         raise MalformedMessage("shared memory: want a name, and pixels of uint8")
     if not (isinstance(shape, list) and 0 < len(shape) <= 4 and all(type(n) is int and n > 0 for n in shape)):
         raise MalformedMessage(f"shared memory: got the shape {shown(shape)}, want (H, W, 3)")
-    size = math.prod(shape)
-    if size > budget.limits.body_bytes:
+    if (size := math.prod(shape)) > budget.limits.body_bytes:
         raise MessageTooLarge(f"shared memory: got {size} bytes, the limit is {budget.limits.body_bytes}")
     budget.hold(size)
     return read_array(memoryview(segments.read(name, size)), "|u1", shape)

@@ -193,8 +193,7 @@ class TabletopWorld:
 def _overlap(puck: Puck, x: float, y: float, distance: float) -> tuple[float, float] | None:
     """Return the shift (dx, dy) that moves a puck to `distance` from (x, y); None if it is far enough away."""
     dx, dy = puck.x - x, puck.y - y
-    have = math.hypot(dx, dy)
-    if have >= distance - _EPSILON:
+    if (have := math.hypot(dx, dy)) >= distance - _EPSILON:
         return None
     if have < _EPSILON:
         return 0.0, -distance  # at the centre any direction is valid, as long as it is always the same

@@ -191,8 +191,7 @@ def difference_interval(strata: Sequence[Pairs]) -> tuple[float, float]:
     Returns:
         (low, high) of the success rate of A minus that of B, each in [-1, 1]; (-1, 1) without episodes.
     """
-    n = sum(one.total for one in strata)
-    if n == 0:
+    if (n := sum(one.total for one in strata)) == 0:
         return -1.0, 1.0
     turns = np.exp(2j * np.pi * np.arange(2 * n + 1) / (2 * n + 1))  # (2n + 1,), one for each sum from -n to n
     transformed = np.ones_like(turns)

@@ -265,8 +265,7 @@ class Store(AbstractContextManager["Store"]):
     def _open(self, config: EvalConfig) -> sqlite3.Connection:
         db = sqlite3.connect(self._out / FILE, timeout=WAIT_S)  # by default each commit reaches the disk
         try:
-            version = db.execute("PRAGMA user_version").fetchone()[0]
-            if version == 0:
+            if db.execute("PRAGMA user_version").fetchone()[0] == 0:
                 db.executescript(f"BEGIN; {SCHEMA} PRAGMA user_version = {VERSION}; COMMIT;")
             require_readable(self._out, db)
             self._require_resumable(db, config)

@@ -196,8 +196,7 @@ def _header(opened: BinaryIO) -> tuple[bytes, list[tuple[int, int]]] | None:
 
     Returns None if the file has another format.
     """
-    length = int.from_bytes(opened.read(8), "little")
-    if length > _LONGEST_HEADER:
+    if (length := int.from_bytes(opened.read(8), "little")) > _LONGEST_HEADER:
         return None
     text = opened.read(length)
     try:

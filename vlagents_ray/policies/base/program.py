@@ -48,8 +48,7 @@ def code_of_class(target: str) -> Program:
     found: Program = {}
     waiting, seen = [module], set()
     while waiting:
-        name = waiting.pop()
-        if name in seen:
+        if (name := waiting.pop()) in seen:
             continue
         seen.add(name)
         if "." in name:

@@ -174,8 +174,7 @@ class VlagentsConnection:
         """
         data = bytearray()
         while len(data) < length:
-            left_s = min(silent_s, deadline - time.monotonic())
-            if left_s <= 0:
+            if (left_s := min(silent_s, deadline - time.monotonic())) <= 0:
                 raise MessageTooLarge("a message took longer than a client may take")
             self._connection.settimeout(left_s)
             if not (more := self._connection.recv(min(length - len(data), 2**20))):
@@ -263,8 +262,7 @@ class SharedMemory:
         data = bytearray(size)
         got = 0
         while got < size:
-            more = os.preadv(descriptor, [memoryview(data)[got:]], got)
-            if more == 0:
+            if (more := os.preadv(descriptor, [memoryview(data)[got:]], got)) == 0:
                 raise InvalidObservation(f"shared memory {name[:40]!r}: became shorter while it was read")
             got += more
         return data
