@@ -23,7 +23,7 @@ import torch
 import typer
 from torch.nn.functional import smooth_l1_loss
 
-from vlagents_ray.open_loop.recorded import Names, RecordedDataset
+from vlagents_ray.open_loop import Names, RecordedDataset
 from vlagents_ray.policies.base.model_inputs import resize_with_pad, state_vector
 from vlagents_ray.policies.reference.checkpoint import (
     CAMERAS,

@@ -51,8 +51,7 @@ def says_its_fields(hint: str = "") -> Callable[[type[T]], type[T]]:
                 made(self, *args, **kwargs)
             except TypeError as error:
                 fields: list[str] = list(cls.__dataclass_fields__)  # type: ignore[attr-defined]
-                unknown = [name for name in kwargs if name not in fields]
-                if not unknown:
+                if not (unknown := [name for name in kwargs if name not in fields]):
                     raise
                 meant = "".join(did_you_mean(name, fields) for name in unknown)
                 raise TypeError(f"{cls.__name__}: got {unknown}, want some of {fields}{meant or hint}") from error

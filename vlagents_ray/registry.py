@@ -35,7 +35,7 @@ class Adapter:
     extra: str | None = None  # extra of this package that installs them
     checkouts: tuple[str, ...] = ()  # variables, one of which names a checkout of the authors' code
     wants: str = ""  # further requirements of its users, such as "assets"
-    tasks: str = ""  # of an environment: the pattern after its name
+    tasks: str = "/<task>"  # of an environment: the pattern after its name
     page: str | None = None  # below docs/policies or docs/benchmarks, "" for no page; None: the page with its name
 
 
@@ -148,28 +148,24 @@ ENVS: dict[str, Adapter] = {
         "ManiSkill 3; 11 tasks need no download",
         needs=("mani_skill", "sapien", "transforms3d"),
         extra="maniskill",
-        tasks="/<task>",
     ),
     "simpler": Adapter(
         "vlagents_ray.envs.simpler:Simpler",
         "SIMPLER's Bridge twins",
         extra="maniskill",
         wants="assets",
-        tasks="/<task>",
     ),
     "metaworld": Adapter(
         "vlagents_ray.envs.metaworld:MetaWorld",
         "Meta-World's 50 tasks",
         needs=("metaworld",),
         extra="metaworld",
-        tasks="/<task>",
     ),
     "robosuite": Adapter(
         "vlagents_ray.envs.robosuite:Robosuite",
         "robosuite's tasks of the robomimic study, one arm and two",
         needs=("robosuite",),
         requirements=("robosuite",),
-        tasks="/<task>",
     ),
     "calvin": Adapter(
         "vlagents_ray.envs.calvin:Calvin",
@@ -185,7 +181,6 @@ ENVS: dict[str, Adapter] = {
         needs=("robocasa",),
         requirements=("robocasa",),
         wants="assets",
-        tasks="/<task>",
     ),
     "rcs": Adapter(
         "vlagents_ray.envs.rcs:Rcs",
@@ -201,7 +196,6 @@ ENVS: dict[str, Adapter] = {
         needs=("duobench",),
         requirements=("rcs",),
         wants="assets",
-        tasks="/<task>",
         page="rcs",
     ),
     "aloha": Adapter(
@@ -209,13 +203,13 @@ ENVS: dict[str, Adapter] = {
         "ALOHA's two simulated tasks, for two arms",
         needs=("gym_aloha", "dm_control"),
         extra="aloha",
-        tasks="/<task>",
     ),
     "pusht": Adapter(
         "vlagents_ray.envs.gymnasium:PushT",
         "PushT, with images or keypoints",
         needs=("gym_pusht", "shapely"),
         extra="pusht",
+        tasks="",
     ),
     "gymnasium": Adapter(
         "vlagents_ray.envs.gymnasium:Gymnasium",
@@ -227,7 +221,6 @@ ENVS: dict[str, Adapter] = {
     "tabletop": Adapter(
         "vlagents_ray.envs.tabletop:Tabletop",
         "the built-in tabletop, numpy alone, for the first run and for tests",
-        tasks="/<task>",
         page="",
     ),
 }

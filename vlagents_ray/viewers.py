@@ -115,9 +115,7 @@ class RerunEpisode:
     """The recording of one episode."""
 
     def __init__(self, rerun: Any, recording: Any, instruction: str, *, live: bool) -> None:
-        self._rerun = rerun
-        self._recording = recording
-        self._live = live
+        self._rerun, self._recording, self._live = rerun, recording, live
         if instruction:
             recording.log("instruction", rerun.TextDocument(instruction), static=True)
 
@@ -282,8 +280,7 @@ class LoopView:
 
     def add(self, obs: Obs, act: Act, executed: np.ndarray | None, tick: int, work_s: float, stop: str = "") -> None:
         """Show a tick with the time that the loop worked, `work_s`, and the reason of a stop; never waits."""
-        viewer = self._viewer
-        if viewer is None:
+        if (viewer := self._viewer) is None:
             return
         if not viewer.has_room:
             viewer.dropped += 1

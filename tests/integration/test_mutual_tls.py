@@ -64,7 +64,7 @@ def test_a_replica_that_others_would_reach_does_not_start_without_keys() -> None
 def test_without_haproxy_serve_asks_for_keys_and_encrypts_by_itself(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(server, "haproxy_binary", lambda: None)
+    monkeypatch.setattr(server.haproxy, "haproxy_binary", lambda: None)
     ca = authority(tmp_path, "ca")
     token = new_key(tmp_path / "keys.json", "arm")
     tls, config = Tls(*ca.sign("server", "IP:127.0.0.2")), deployment("noop")

@@ -62,8 +62,7 @@ class LineProcess:
             ready, _, _ = select.select([self._output], [], [], max(0.0, deadline - time.monotonic()))
             if not ready:
                 raise ProcessFailed(f"{self.name}: no answer within {timeout_s:g} s\n{self._last_errors()}".rstrip())
-            more = os.read(self._output.fileno(), 2**16)
-            if not more:
+            if not (more := os.read(self._output.fileno(), 2**16)):
                 with contextlib.suppress(subprocess.TimeoutExpired):
                     self._process.wait(_END_S)
                 status = self._process.returncode

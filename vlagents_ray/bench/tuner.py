@@ -254,8 +254,7 @@ class Tuner:
         """Return the batch sizes to measure, ascending: the fixed ones, or else 1, 2, 4, …"""
         fixed = self._plan.args.batch.sizes or self.fixed
         sizes = fixed or [2**power for power in range(self._plan.max_batch.bit_length())]
-        found = [size for size in sizes if size <= self._plan.max_batch]
-        if not found:
+        if not (found := [size for size in sizes if size <= self._plan.max_batch]):
             raise ConfigError(f"--max-batch: got {self._plan.max_batch}, the file's smallest fixed size is {sizes[0]}")
         return found
 
@@ -401,8 +400,7 @@ def largest_difference(actions: Sequence[np.ndarray], wanted: Sequence[np.ndarra
 
 def recorded_observations(folder: Path, count: int) -> list[Obs]:
     """Read observations, spread evenly over the trajectories below a folder and over their steps."""
-    files = sorted(folder.rglob("*.npz"))
-    if not files:
+    if not (files := sorted(folder.rglob("*.npz"))):
         raise ConfigError(f"--frames {folder}: holds no trajectory (.npz), want a folder of them, as evaluations save")
     used = files[:: max(1, len(files) // count)][:count]
     found: list[Obs] = []

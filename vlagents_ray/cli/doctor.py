@@ -150,8 +150,7 @@ def open_files() -> Check:
 
 def judge_open_files(soft: int, hard: int) -> Check:
     """Judge the limits; Ray raises the soft one by itself, up to the hard one or 65536."""
-    effective = max(soft, min(hard, _FILES_RAISED_TO))
-    if effective >= _FILES_ENOUGH:
+    if (effective := max(soft, min(hard, _FILES_RAISED_TO))) >= _FILES_ENOUGH:
         return Check("ok", f"{soft} a process, {effective} under Ray")
     cure = f"ulimit -Hn {_FILES_WANTED} as root, or LimitNOFILE={_FILES_WANTED} in the service's systemd unit"
     return Check("warn", f"{effective} a process; many robots or workers at once may run out", cure)
@@ -305,8 +304,7 @@ def judge_library(name: str, driver: str | None, version: str, cuda: str | None,
 
 def triton_compiler(headers: Path) -> Check:
     """Check that Triton finds a C compiler and Python's headers, with which it builds a program that starts kernels."""
-    compiler = os.environ.get("CC") or shutil.which("gcc") or shutil.which("clang")
-    if compiler is None:
+    if (compiler := os.environ.get("CC") or shutil.which("gcc") or shutil.which("clang")) is None:
         return Check("warn", "none, which torch.compile needs on a GPU", "apt-get install gcc libc6-dev")
     if not (headers / "Python.h").exists():
         return Check("warn", f"{compiler}, but no {headers}/Python.h", "apt-get install python3-dev, of this version")

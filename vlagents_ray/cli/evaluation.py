@@ -178,8 +178,7 @@ def require_results(config: EvalConfig, summary: Summary) -> None:
         (_, _, error), _ = errors_of_policies(summary.results.among(failing))[0]
         where = ", ".join(f"{cell.contender} in {cell.task}" for cell in failing)
         fail(f"every episode ended by an error of the policy: {where}; the first one: {error.strip()}", POLICY_ERRORS)
-    missing = sum(cell.missing for cell in mine)
-    if not missing:
+    if not (missing := sum(cell.missing for cell in mine)):
         return
     lost = [attempt for cell in mine for attempt in cell.attempts if not attempt.retried]
     last = max(lost, key=lambda attempt: attempt.at, default=None)
@@ -225,8 +224,7 @@ def watch_training(
 
     out.print(f"watching {watcher.folder}{'' if watcher.folder.is_dir() else ', which is not there yet'}")
     found = rounds(watcher, until, pause)
-    first = next(found, None)
-    if first is None:
+    if (first := next(found, None)) is None:
         raise ConfigError(f"{watcher.folder}: watching ended without a checkpoint; still waiting: {watcher.waiting()}")
     workers = 1 if config.workers is None else config.workers  # a training is long
     planned = _at(config, place, first).model_copy(update={"workers": workers})

@@ -111,8 +111,7 @@ def missing_packages(name: str, *, checkout: bool = True) -> str | None:
 
 def _lacking(name: str) -> tuple[list[str], list[str], str]:
     """Return the modules and checkout variables that a family lacks, and its requirements file."""
-    one = dict(families()).get(name)
-    if one is None:
+    if (one := dict(families()).get(name)) is None:
         return [], [], ""
     given = any(os.environ.get(variable) for variable in one.checkouts)
     lacking = [module for module in one.needs[given:] if importlib.util.find_spec(module) is None]

@@ -10,18 +10,11 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from vlagents_ray.cli import results
 from vlagents_ray.cli.console import errors, fail, fresh, out, progress, table
 from vlagents_ray.cli.evaluate import evaluate_command
 from vlagents_ray.cli.keys import keys
 from vlagents_ray.cli.new import new
-from vlagents_ray.cli.results import (
-    bundle_command,
-    export_command,
-    merge_command,
-    replay_command,
-    report_command,
-    verify_command,
-)
 from vlagents_ray.cli.serve import serve_command
 from vlagents_ray.cli.slurm import slurm
 from vlagents_ray.cli.tune import tune_command
@@ -66,14 +59,14 @@ def demo(out_dir: Annotated[Path, typer.Option("--out", help="Folder of the resu
         run_evaluation(EvalConfig(policies=[policy], suites=[suite], workers=2, video="all", out=fresh(out_dir)))
 
 
-app.command("bundle")(bundle_command)
+app.command("bundle")(results.bundle_command)
 app.command("eval")(evaluate_command)
-app.command("export")(export_command)
-app.command("merge")(merge_command)
-app.command("replay")(replay_command)
-app.command("report")(report_command)
+app.command("export")(results.export_command)
+app.command("merge")(results.merge_command)
+app.command("replay")(results.replay_command)
+app.command("report")(results.report_command)
 app.command("tune")(tune_command)
-app.command("verify")(verify_command)
+app.command("verify")(results.verify_command)
 app.add_typer(env, name="env")
 app.add_typer(keys, name="keys")
 app.add_typer(new, name="new")
@@ -110,8 +103,7 @@ def _list(listed: Sequence[Listed], name: str | None, *, as_json: bool) -> None:
     """Print a listing: a line for each with installation commands, or the full description of one name."""
     from vlagents_ray.cli.listing import installing
 
-    chosen = [one for one in listed if name in (None, one.name)]
-    if not chosen:
+    if not (chosen := [one for one in listed if name in (None, one.name)]):
         fail(f"{name!r} is not registered{did_you_mean(str(name), [one.name for one in listed])}", 2)
     if as_json:
         out.print(json.dumps([asdict(one) for one in chosen], indent=2, default=str))

@@ -59,8 +59,7 @@ def _write(name: str, kind: Literal["policy", "env", "dialect"]) -> None:
         Path(path): Template((templates / f"{source}.template").read_text("utf-8")).substitute(names)
         for path, source in sources.items()
     }
-    there = [str(path) for path in texts if path.exists()]
-    if there:
+    if there := [str(path) for path in texts if path.exists()]:
         raise ConfigError(f"{', '.join(there)}: there already, and nothing was written; choose another NAME")
     if importlib.util.find_spec(name) is not None:
         raise ConfigError(f"NAME: {name!r} is a module that is installed, and yours would hide it; choose another one")

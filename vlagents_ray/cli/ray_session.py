@@ -95,14 +95,12 @@ class _Terminal:
 
     def __init__(self, kept: logging.Handler | None, started: threading.Event | None) -> None:
         self.failing: set[str] = set()  # processes in the middle of a policy's traceback
-        self._kept = kept
-        self._started = started
+        self._kept, self._started = kept, started
 
     def is_shown(self, record: logging.LogRecord) -> bool:
         """Return whether a record of this process is a problem; for `logging`."""
         text = record.getMessage()
-        shown = _is_problem(text, record.levelno)
-        if not shown:
+        if not (shown := _is_problem(text, record.levelno)):
             self._note(text)
         return shown
 

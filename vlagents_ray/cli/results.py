@@ -13,7 +13,7 @@ from vlagents_ray.cli.options import Address, Live, LiveAt, parse_list, parse_se
 from vlagents_ray.errors import ConfigError
 
 if TYPE_CHECKING:
-    from vlagents_ray.open_loop.replay import ReplayPlan
+    from vlagents_ray.open_loop import ReplayPlan
 
 
 def report_command(
@@ -41,8 +41,7 @@ def report_command(
             return
         results = combined([Results.load(folder) for folder in folders])
         path = html or (folders[0] / FILE if len(folders) == 1 else Path(FILE))
-        written = write_report(results, path, inline=inline)
-        out.print(f"report: {written}")
+        out.print(f"report: {write_report(results, path, inline=inline)}")
 
 
 def export_command(
@@ -178,8 +177,7 @@ def replay_command(
                 raise ConfigError(f"{folder}: is a dataset, got {episode!r}; want --episodes, or none of it")
             if policy is None:
                 raise ConfigError(f"{folder}: is a dataset: want --policy, a name, a deployment file or a URL")
-            from vlagents_ray.open_loop.recorded import Names
-            from vlagents_ray.open_loop.replay import ReplayPlan
+            from vlagents_ray.open_loop import Names, ReplayPlan
 
             chosen = None if episodes is None else parse_episodes(episodes)
             pairs = [part.partition("=") for part in parse_list(cameras or "")]
@@ -212,7 +210,7 @@ def replay_command(
 
 def replay_dataset(folder: Path, policy: str, into: Path, plan: ReplayPlan) -> None:
     """Play a dataset to a policy, print the errors, and write them as JSON."""
-    from vlagents_ray.open_loop.replay import candidate, replay, write_result
+    from vlagents_ray.open_loop import candidate, replay, write_result
 
     with candidate(policy) as sessions:
         result = replay(folder, sessions, plan)

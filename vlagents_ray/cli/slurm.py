@@ -135,8 +135,7 @@ def _click(command: Callable[..., None]) -> Any:
 
 
 def _refuse(given: dict[str, Any], why: str, *names: str) -> None:
-    said = [f"--{name.replace('_', '-')}" for name in names if given[name]]
-    if said:
+    if said := [f"--{name.replace('_', '-')}" for name in names if given[name]]:
         raise ConfigError(f"{', '.join(said)}: not for a job: {why}; leave it out")
 
 

@@ -50,9 +50,7 @@ class Connection:
         The time limits are the defaults of a call and of `open`. With `leaves_silent` it switches to another replica
         when one no longer answers.
         """
-        self.url = url
-        self._new_transport = new_transport
-        self._leaves_silent = leaves_silent
+        self.url, self._new_transport, self._leaves_silent = url, new_transport, leaves_silent
         self._silent_since: float | None = None  # time.monotonic(); calls begun since then have no answer
         self._silent = False  # whether the silence has lasted for `SILENT_S`
         # The transport to the silent replica, kept until another one answers, since its sessions may still be moved.
@@ -60,8 +58,7 @@ class Connection:
         self._next: _NextTransport | None = None  # to the next replica, while the current one still answers
         self._look_up_at = float("-inf")  # time.monotonic(), earliest time of the next look-up
         self.transport = new_transport()
-        self.codec = codec
-        self.timeout_s = timeout_s
+        self.codec, self.timeout_s = codec, timeout_s
         self.metadata: dict[str, Any] | None = None
         self.contract: Contract | None = None
         self.users: set[object] = set()  # owners of the sessions

@@ -54,7 +54,7 @@ class Aloha(SimulatorEnv):
     LeRobot clips them.
     """
 
-    suite, title = "aloha", "gym-aloha"
+    suite, title, known = "aloha", "gym-aloha", tuple(_TASKS)
     packages, distributions = ("gym_aloha", "dm_control", "mujoco"), ("gym-aloha", "dm-control", "mujoco")
     cure = "pip install 'vlagents-ray[aloha]'"
     _protocol = PROTOCOL
@@ -105,10 +105,6 @@ class Aloha(SimulatorEnv):
             ),
             control_hz=PROTOCOL.control_hz,
         )
-
-    @classmethod
-    def tasks(cls) -> list[str]:
-        return list(_TASKS)
 
     def describe(self) -> dict[str, Any]:
         return super().describe() | {"control_mode": "joint_position"}

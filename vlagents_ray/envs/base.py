@@ -7,7 +7,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Collection, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 
@@ -84,6 +84,8 @@ class EvalEnv(Environment):
     observation, in any process and after any other episodes.
     """
 
+    known: ClassVar[Collection[str]] = ()  # the names of the tasks, for `tasks`
+
     @property
     @abstractmethod
     def instruction(self) -> str:
@@ -125,7 +127,7 @@ class EvalEnv(Environment):
     @classmethod
     def tasks(cls) -> list[str]:
         """List the known tasks; empty if the simulator accepts any name."""
-        return []
+        return list(cls.known)
 
     @classmethod
     def require_task(cls, task: str | None) -> None:
@@ -316,8 +318,7 @@ def make_batch(name: str, num_envs: int, **options: Any) -> BatchEnv:
     if num_envs < 1:
         raise ConfigError(f"env {name!r}: num_envs is {num_envs}, want at least 1")
     cls, arguments = env_arguments(name, options)
-    together = cls.batched(num_envs, **arguments)
-    if together is not None:
+    if (together := cls.batched(num_envs, **arguments)) is not None:
         return together
     with ExitStack() as made:
         envs = [made.enter_context(cls(**arguments)) for _ in range(num_envs)]
@@ -358,8 +359,7 @@ class SequentialBatch(BatchEnv):
         return self._seen[index]
 
     def step(self, acts: Sequence[Act | None]) -> Steps:
-        n = len(acts)
-        if n != self._playing:
+        if (n := len(acts)) != self._playing:
             raise ConfigError(f"step: got {n} actions, want {self._playing}, one for each episode or None")
         moving = {i: act for i, act in enumerate(acts) if act is not None}
         if n > 1:  # a single environment checks its action itself
@@ -396,8 +396,7 @@ class SequentialBatch(BatchEnv):
         """
         if len(seen) == 1 or not moved or not self.looked_at:
             return seen
-        shown = seen[min(moved)].cameras
-        if not shown:
+        if not (shown := seen[min(moved)].cameras):
             return seen
         cameras = [obs.cameras if i in moved else {**shown, **obs.cameras} for i, obs in enumerate(seen)]
         images = {name: np.stack([one[name] for one in cameras]) for name in cameras[0]}

@@ -167,7 +167,7 @@ class Calvin(SimulatorEnv):
     `info["tasks"]` are CALVIN's names of the chain, `info["solved"]` is the number of solved tasks.
     """
 
-    suite = "calvin"
+    suite, known = "calvin", SCENES
     _contract = CONTRACT
     several_tasks = True
     init_states = NUMBER
@@ -215,10 +215,6 @@ class Calvin(SimulatorEnv):
     def instruction(self) -> str:
         """The current task in the words of CALVIN's evaluation."""
         return self._words[self._playing().tasks[min(self._done, TASKS - 1)]]
-
-    @classmethod
-    def tasks(cls) -> list[str]:
-        return list(SCENES)
 
     @classmethod
     def missing(cls) -> str | None:
@@ -319,8 +315,7 @@ def find_checkout(chosen: str | None) -> Path:
 
 def make_simulator(checkout: Path, scene: str, renderer: RendererName) -> Any:
     """Make CALVIN's `PlayTableSimEnv` of a scene, with the cameras, arm and rates of its datasets."""
-    folder = str(checkout / _PACKAGE)
-    if folder not in sys.path:
+    if (folder := str(checkout / _PACKAGE)) not in sys.path:
         sys.path.insert(0, folder)
     if device := os.environ.get(EGL_DEVICE):
         os.environ.setdefault("EGL_VISIBLE_DEVICES", device)

@@ -88,8 +88,7 @@ class _Functions:
         return EglDevice(number, _SOFTWARE in extensions, cuda)
 
     def _extension(self, name: str, result: Any, *arguments: Any) -> Any:
-        address = self.library.eglGetProcAddress(name.encode())
-        if not address:
+        if not (address := self.library.eglGetProcAddress(name.encode())):
             raise AttributeError(name)
         return ctypes.CFUNCTYPE(result, *arguments)(address)
 
@@ -156,8 +155,7 @@ def prepare_rendering() -> None:
 
 def choose_devices() -> None:
     """Set the variables that select the devices, before libraries are loaded; variables set by the user are kept."""
-    gpu = has_gpu()
-    if gpu is None:
+    if (gpu := has_gpu()) is None:
         return
     if EGL_DEVICE not in os.environ and (device := fitting(devices(), gpu=gpu)) is not None:
         os.environ[EGL_DEVICE] = str(device.number)

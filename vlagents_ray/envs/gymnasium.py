@@ -152,9 +152,7 @@ class Gymnasium(EvalEnv):
         self._module = module if module is not None else defaults.module
         self._kwargs = {**defaults.kwargs, **(kwargs or {})}
         self._protocol = defaults.protocol
-        self._success = success
-        self._unit_actions = unit_actions
-        self._remake = remake
+        self._success, self._unit_actions, self._remake = success, unit_actions, remake
         self._ready = False
         self._steps = 0
         self._env = self._make(max_steps)
@@ -319,16 +317,14 @@ class PushT(Gymnasium):
     Action: (2,) in [0, 512]: the target of the disc, in the same pixels.
     """
 
+    known = tuple(_TASKS)
+
     def __init__(
         self, task: str = "image", *, width: int | None = None, height: int | None = None, max_steps: int | None = None
     ) -> None:
         """Make the environment; images are stretched to `width` and `height`, pixels."""
         self.require_task(task)
         super().__init__(_ID, **_TASKS[task], width=width, height=height, max_steps=max_steps)
-
-    @classmethod
-    def tasks(cls) -> list[str]:
-        return list(_TASKS)
 
     @classmethod
     def require_task(cls, task: str | None) -> None:

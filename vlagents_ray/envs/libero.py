@@ -396,8 +396,7 @@ class LiberoSimulation:
 
     def __init__(self, task: LiberoTask, protocol: LiberoProtocol, assets: Path) -> None:
         self._package: Any = require("libero.libero")
-        self._assets = assets
-        self._protocol = protocol
+        self._assets, self._protocol = assets, protocol
         self._use_assets()
         self._env: Any = require("libero.libero.envs").OffScreenRenderEnv(
             bddl_file_name=str(task.problem),

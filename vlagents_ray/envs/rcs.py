@@ -257,10 +257,6 @@ class Rcs(SimulatorEnv):
             require_known(cls.suite, task, cls.tasks(), ", or an id, as in 'lab/shelf'")
 
     @classmethod
-    def tasks(cls) -> list[str]:
-        return sorted(cls.known)
-
-    @classmethod
     def missing(cls) -> str | None:
         return missing_packages(*cls.packages)
 

@@ -136,7 +136,7 @@ class RoboCasa(RobosuiteEnv):
     gripper, which closes at 0.5 or more and opens below that.
     """
 
-    suite, title = "robocasa", "RoboCasa"
+    suite, title, known = "robocasa", "RoboCasa", tuple(HORIZONS)
     packages = ("robocasa", "robosuite", "mujoco")
     cure = "run `vlagents-ray env make requirements/robocasa.txt` and give the evaluation's workers that Python"
     _raw: Mapping[str, str] = {
@@ -234,10 +234,6 @@ class RoboCasa(RobosuiteEnv):
             control_hz=CONTROL_HZ,
         )
 
-    @classmethod
-    def tasks(cls) -> list[str]:
-        return list(HORIZONS)
-
     def describe(self) -> dict[str, Any]:
         facts = super().describe() | self._versions
         if set(self._registries) != set(REGISTRIES):
@@ -270,8 +266,7 @@ def require_assets(registries: Sequence[str] = REGISTRIES) -> None:
         return
     folder = Path(spec.origin).parent / "models" / "assets"
     wanted = ["textures", "fixtures/stoves", *(f"objects/{name}" for name in registries)]
-    lacks = [part for part in wanted if not (folder / part).is_dir()]
-    if lacks:
+    if lacks := [part for part in wanted if not (folder / part).is_dir()]:
         types = " ".join(TYPES[part] for part in lacks)
         raise EnvFailed(
             f"robocasa: the assets in {folder} lack {lacks}; download them once, about 10 GB, with that environment's "

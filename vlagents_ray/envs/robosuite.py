@@ -208,6 +208,7 @@ class Robosuite(RobosuiteEnv):
     """
 
     suite = title = "robosuite"
+    known = tuple(TASKS)
     packages, distributions = ("robosuite", "mujoco"), ("robosuite", "mujoco")
     cure = "run `vlagents-ray env make requirements/robosuite.txt` and give the evaluation's workers that Python"
 
@@ -279,10 +280,6 @@ class Robosuite(RobosuiteEnv):
             action=replace(DELTA_POSE, dim=7 * len(task.arms), arms=task.arms if len(task.arms) > 1 else None),
             control_hz=CONTROL_HZ,
         )
-
-    @classmethod
-    def tasks(cls) -> list[str]:
-        return list(TASKS)
 
     def _sim_state(self, raw: Mapping[str, Any]) -> dict[str, np.ndarray]:
         env, found = self._env, super()._sim_state(raw)

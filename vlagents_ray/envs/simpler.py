@@ -73,7 +73,7 @@ class Simpler(SimulatorEnv):
     `terminated`.
     """
 
-    suite = "simpler"
+    suite, known = "simpler", tuple(TWINS)
 
     def __init__(
         self,
@@ -138,10 +138,6 @@ class Simpler(SimulatorEnv):
         return self._alive().instructions()[0] if self._given_instruction is None else self._given_instruction
 
     @classmethod
-    def tasks(cls) -> list[str]:
-        return sorted(TWINS)
-
-    @classmethod
     def missing(cls) -> str | None:
         folder = Path(os.environ.get("MS_ASSET_DIR", Path.home() / ".maniskill"))
         return ManiSkill.missing() or _missing_assets(folder)
@@ -193,7 +189,6 @@ def _command(action: np.ndarray) -> np.ndarray:
 
 
 def _missing_assets(folder: Path) -> str | None:
-    lacks = [place for place in _DATA.values() if not (folder / "data" / place).is_dir()]
-    if not lacks:
+    if not (lacks := [place for place in _DATA.values() if not (folder / "data" / place).is_dir()]):
         return None
     return f"SIMPLER's assets are not in {folder} (no data/{lacks[0]}); set MS_ASSET_DIR, or get them: {_DOWNLOADS}"

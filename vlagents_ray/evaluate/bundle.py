@@ -31,18 +31,8 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from vlagents_ray.envs.base import make_batch
 from vlagents_ray.errors import ConfigError, VLAgentsError
+from vlagents_ray.evaluate.artifacts import storage
 from vlagents_ray.evaluate.artifacts.recorder import Trajectory
-from vlagents_ray.evaluate.artifacts.storage import (
-    PROVENANCE,
-    TRAJECTORIES,
-    VIDEOS,
-    inside,
-    link_or_copy,
-    require_below,
-    storing,
-    versions,
-    whole,
-)
 from vlagents_ray.evaluate.episode.episode import options_of_reset
 from vlagents_ray.evaluate.episode.failures import EnvStep, env_side
 from vlagents_ray.evaluate.episode.second_pass import play_actions
@@ -64,8 +54,8 @@ _MOST_MANIFEST = 64 * 2**20  # bytes
 _CHUNK = 2**20
 _PART = r"[\w@-][\w.@-]{0,200}"  # of a path, as `naming.plain` leaves names: it neither is nor begins with a dot
 _KNOWN = re.compile(
-    rf"{re.escape(MANIFEST)}|{re.escape(DATABASE)}|{PROVENANCE}/[0-9a-f]{{64}}\.diff"
-    rf"|{TRAJECTORIES}/({_PART}/){{1,3}}{_PART}\.(npz|mp4)|{VIDEOS}/({_PART}/){{1,3}}{_PART}\.mp4"
+    rf"{re.escape(MANIFEST)}|{re.escape(DATABASE)}|{storage.PROVENANCE}/[0-9a-f]{{64}}\.diff"
+    rf"|{storage.TRAJECTORIES}/({_PART}/){{1,3}}{_PART}\.(npz|mp4)|{storage.VIDEOS}/({_PART}/){{1,3}}{_PART}\.mp4"
 )
 _BROKEN = (zipfile.BadZipFile, zlib.error, EOFError, NotImplementedError, RuntimeError, ValueError)
 _DISTRUST = "no `vlagents-ray bundle` writes that: do not trust the author of this bundle"
@@ -111,7 +101,7 @@ def pack(folder: Path, archive: Path) -> str:
         raise ConfigError(f"{folder}: got the files {odd[:5]}, which a bundle may not hold; rename or remove them")
     manifest = Manifest(files={name: digest_of(path) for name, path in names.items()})
     text = (manifest.model_dump_json(indent=1) + "\n").encode()
-    with whole(archive) as part, zipfile.ZipFile(part, "w", zipfile.ZIP_DEFLATED) as file:
+    with storage.whole(archive) as part, zipfile.ZipFile(part, "w", zipfile.ZIP_DEFLATED) as file:
         file.writestr(_member(MANIFEST), text, zipfile.ZIP_DEFLATED)
         for name, path in names.items():
             how = zipfile.ZIP_STORED if path.suffix in (".mp4", ".npz") else zipfile.ZIP_DEFLATED  # already compressed
@@ -231,7 +221,7 @@ def write_bundle(folder: Path, archive: Path, *, videos: bool = False) -> str:
         ConfigError: The folder has no results, or one of its files is outside of it.
         StorageFailed: The disk is full, or cannot be written to.
     """
-    with storing(archive.parent):
+    with storage.storing(archive.parent):
         archive.parent.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryDirectory(prefix=f"{archive.name}.part-", dir=archive.parent) as temporary:
             stage = Path(temporary)
@@ -255,15 +245,15 @@ def _link_files(folder: Path, stage: Path, results: Results, *, videos: bool) ->
             if videos:
                 paths += one.videos
             if one.trajectory is not None:
-                paths.append(require_below(one.trajectory))
+                paths.append(storage.require_below(one.trajectory))
                 numbers = folder / one.trajectory
                 seen = sorted(numbers.parent.glob(f"{escape(numbers.stem)}_*.mp4")) if videos else []
                 paths += [str(path.relative_to(folder)) for path in seen]
-    paths += [f"{PROVENANCE}/{path.name}" for path in sorted((folder / PROVENANCE).glob("*.diff"))]
+    paths += [f"{storage.PROVENANCE}/{path.name}" for path in sorted((folder / storage.PROVENANCE).glob("*.diff"))]
     for path in dict.fromkeys(paths):
-        source = inside(folder, path)
+        source = storage.inside(folder, path)
         if source.is_file():  # a folder that was copied without its videos can be bundled
-            link_or_copy(source, stage / path)
+            storage.link_or_copy(source, stage / path)
 
 
 Verdict = Literal["equal", "differs", "other here", "not checked"]
@@ -326,7 +316,7 @@ def verify(
     if into is not None and into.exists():
         raise ConfigError(f"{into}: is there already; want a new folder")
     parent = None if into is None else into.absolute().parent
-    with storing(parent or Path(tempfile.gettempdir())):
+    with storage.storing(parent or Path(tempfile.gettempdir())):
         if parent is not None:
             parent.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryDirectory(prefix="bundle.part-", dir=parent) as temporary:
@@ -368,8 +358,7 @@ def _check(folder: Path, replay: int, *, trust: bool) -> Iterator[Finding]:
     by_cell = [[(cell, one) for one in cell.episodes if one.result.status == "done"] for cell in results.cells]
     turns = (pair for turn in zip_longest(*by_cell) for pair in turn if pair is not None)
     found = ((*pair, trajectory) for pair in turns if (trajectory := _recorded(results, pair[1])) is not None)
-    chosen = list(islice(found, replay))
-    if not chosen:
+    if not (chosen := list(islice(found, replay))):
         yield Finding("replay", "not checked", "no finished episode has a recording (eval --record all)")
     for cell, episode, trajectory in chosen:
         yield _replay(cell, episode, trajectory, trust=trust)
@@ -459,7 +448,7 @@ def _finding(subject: str, odd: list[str], fine: str) -> Finding:
 
 def _check_versions(results: Results) -> Finding:
     """Compare the software of the last run with that here."""
-    there, here = results.runs[-1].versions, versions()
+    there, here = results.runs[-1].versions, storage.versions()
     stated = {name: (there.get(name), here[name]) for name in _SOFTWARE} | {"commit": (_commit(there), _commit(here))}
     odd = [f"{name} {was} there, {now} here" for name, (was, now) in stated.items() if was != now]
     if odd:

@@ -46,14 +46,12 @@ class CheckpointWatcher:
             marker: The name of a file that the trainer writes last, if it does.
         """
         parts = PurePath(pattern).parts
-        place = next((i for i, part in enumerate(parts) if STEP in part), None)
-        if place is None:
+        if (place := next((i for i, part in enumerate(parts) if STEP in part), None)) is None:
             raise ConfigError(f"checkpoint {pattern!r}: has no {STEP} in it; write one where the step stands")
         self.folder = Path(*parts[:place]) if folder is None else folder
         self._below = parts[place + 1 :]
         self._name = re.compile(re.escape(parts[place]).replace(re.escape(STEP), r"(\d+)", 1))
-        self._settle_s = settle_s
-        self._marker = marker
+        self._settle_s, self._marker = settle_s, marker
         self._seen: dict[int, _SeenFile] = {}
         self._complete: set[int] = set()
 

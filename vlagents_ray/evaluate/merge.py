@@ -15,15 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from vlagents_ray.errors import ConfigError
-from vlagents_ray.evaluate.artifacts.storage import (
-    PROVENANCE,
-    inside,
-    link_or_copy,
-    require_below,
-    require_there,
-    storing,
-    whole,
-)
+from vlagents_ray.evaluate.artifacts import storage
 from vlagents_ray.evaluate.plan.config import canonical
 from vlagents_ray.evaluate.report.page import FILE as REPORT
 from vlagents_ray.evaluate.report.page import write_report
@@ -94,7 +86,7 @@ def merge(out: Path, folders: Sequence[Path], *, keep_first: bool = False, accep
             f"{len(conflicts)} episodes have different outcomes:\n{shown}\n"
             f"find out why (vlagents-ray replay), or keep those of the folders named first (--keep-first)"
         )
-    with storing(out):
+    with storage.storing(out):
         _link_files(merged, out, folders)
         tables = {
             "runs": merged.runs,
@@ -104,7 +96,7 @@ def merge(out: Path, folders: Sequence[Path], *, keep_first: bool = False, accep
             "attempts": merged.attempts,
             "workers": merged.workers,
         }
-        with whole(out / FILE) as part, closing(sqlite3.connect(part)) as db:
+        with storage.whole(out / FILE) as part, closing(sqlite3.connect(part)) as db:
             db.executescript(f"BEGIN; {SCHEMA} PRAGMA user_version = {VERSION}; COMMIT;")
             with db:
                 for name, row in ((name, row) for name, rows in tables.items() for row in rows):
@@ -219,19 +211,19 @@ def _link_files(merged: _Merged, out: Path, folders: Sequence[Path]) -> None:
     sources: dict[Path, Path] = {}
     for key, row in merged.episodes.items():
         home = merged.home[key]
-        paths = [require_below(path) for path in json.loads(row["videos"])]
+        paths = [storage.require_below(path) for path in json.loads(row["videos"])]
         if row["trajectory"] is not None:
-            numbers = home / require_below(row["trajectory"])
+            numbers = home / storage.require_below(row["trajectory"])
             seen = sorted(numbers.parent.glob(f"{escape(numbers.stem)}_*.mp4"))
             paths += [str(path.relative_to(home)) for path in (*seen, numbers)]
         for path in paths:
-            sources[out / path] = require_there(inside(home, path))
+            sources[out / path] = storage.require_there(storage.inside(home, path))
     for folder in folders:
-        for diff in sorted((folder / PROVENANCE).glob("*.diff")):
-            name = f"{PROVENANCE}/{diff.name}"
-            sources[out / name] = inside(folder, name)
+        for diff in sorted((folder / storage.PROVENANCE).glob("*.diff")):
+            name = f"{storage.PROVENANCE}/{diff.name}"
+            sources[out / name] = storage.inside(folder, name)
     for target, source in sources.items():  # check that all exist before anything is written
-        link_or_copy(source, target)
+        storage.link_or_copy(source, target)
 
 
 def combined(folders: Sequence[Results]) -> Results:

@@ -98,8 +98,7 @@ def compare(recorded: Recorded, replayed: Results) -> list[str]:
 
 
 def _actions(recorded: Recorded, replayed: Path) -> str:
-    path = recorded.episode.trajectory
-    if path is None:
+    if (path := recorded.episode.trajectory) is None:
         return (
             "actions: they differ; from which step on is not known, as no trajectory was recorded "
             "(eval --record all, or `record: all` in its file)"

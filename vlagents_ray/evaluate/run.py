@@ -306,8 +306,7 @@ class Deadline:
 
     def end(self, job: Job) -> None:
         """Note that an attempt at this episode has ended, successful or not."""
-        begun = self._begun.pop(job.key, None)
-        if begun is not None:
+        if (begun := self._begun.pop(job.key, None)) is not None:
             self._longest_s = max(self._longest_s, self._now() - begun)
 
     @property

@@ -302,8 +302,7 @@ def _require_complete(folder: Path, saved: Mapping[str, Any], network: Any) -> N
 def _require_adaptable(folder: Path, names: list[str], modules: Mapping[str, Any]) -> None:
     from torch.nn import Conv2d, Linear
 
-    unknown = sorted(name for name in names if name not in modules)
-    if unknown:
+    if unknown := sorted(name for name in names if name not in modules):
         raise ConfigError(
             f"{folder / WEIGHTS}: {len(unknown)} of its {len(names)} layers are not in the network: "
             f"{unknown[:_LISTED]}; want an adapter that was trained on this checkpoint, with this version of its code"

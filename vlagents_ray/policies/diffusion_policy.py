@@ -255,8 +255,7 @@ def _made(path: Path, settings: Any) -> Any:
 
 
 def _inputs(module: Any, settings: Any) -> tuple[dict[str, tuple[int, int]], dict[str, int]]:
-    shapes = settings.policy.get("shape_meta")
-    if shapes is None:
+    if (shapes := settings.policy.get("shape_meta")) is None:
         return {}, {OBS: module.obs_dim}
     images = {name: one for name, one in shapes.obs.items() if one.get("type", "low_dim") == "rgb"}
     vectors = {name: one for name, one in shapes.obs.items() if name not in images}

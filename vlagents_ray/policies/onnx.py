@@ -436,8 +436,7 @@ class Network:
             "inputs without a source": left,
             "one of them the action": [] if config.action.output or len(free) == 1 else free or ["none of the outputs"],
         }
-        said = "; ".join(f"{what}: {names}" for what, names in problems.items() if names)
-        if said:
+        if said := "; ".join(f"{what}: {names}" for what, names in problems.items() if names):
             raise ConfigError(
                 f"the file has inputs {', '.join(f'{name} {one.shape}' for name, one in inputs.items())} and outputs "
                 f"{outputs}, which the settings do not fit, {said}; name each input in `cameras`, `recurrent` or "

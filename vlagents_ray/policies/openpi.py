@@ -92,8 +92,7 @@ def choose_robot(
     layout: Layout | None,
 ) -> RobotConvention:
     """Return the convention of a config's robot, overridden by the settings; raises `ConfigError` if it is unknown."""
-    usual = ROBOTS.get(transform)
-    if usual is None:
+    if (usual := ROBOTS.get(transform)) is None:
         if cameras is None or state is None:
             raise ConfigError(
                 f"config {config!r}: its observations go through {transform or 'no transform'}, want one of "
@@ -187,8 +186,7 @@ def _statistics(folder: Path, asset: str | None) -> Any:
             f"checkpoint {folder}: no assets/{asset}/norm_stats.json, has those of {have}; without statistics a "
             f"policy's actions have no units: copy them there, or choose the config of its training"
         ) from error
-    absent = sorted({"state", "actions"} - set(found))
-    if absent:
+    if absent := sorted({"state", "actions"} - set(found)):
         raise ConfigError(f"checkpoint {folder}: assets/{asset}/norm_stats.json has no {absent}, has {sorted(found)}")
     return found
 
@@ -539,8 +537,7 @@ class OpenPi(ModelPolicy):
     def predict(self, rows: Sequence[Row]) -> list[Prediction | Exception]:
         """Compute the chunks of all rows that openpi's transforms accept, in one call of the model."""
         read = [attempt(self._planned, row) for row in rows]
-        spare = next((one for one in read if not isinstance(one, Exception)), None)
-        if spare is None:
+        if (spare := next((one for one in read if not isinstance(one, Exception)), None)) is None:
             return read  # errors all
         # A valid row replaces an invalid one, so that the number of rows stays one that is compiled.
         spare = replace(spare, row=replace(spare.row, want=()))

@@ -131,8 +131,7 @@ class Pi0(ModelPolicy):
         except (TypeError, ValueError) as error:
             raise ConfigError(f"{file}: is no processor's config ({error}); copy it again") from error
         base = {name: list(getattr(self.loaded().processor, name)) for name in _STATISTICS}
-        other = [name for name in _STATISTICS if saved.get(name) not in (None, base[name])]
-        if other:
+        if other := [name for name in _STATISTICS if saved.get(name) not in (None, base[name])]:
             raise ConfigError(
                 f"{file}: got other {other} than the base has, want the same; merge the adapter into its base, and "
                 f"serve that as a checkpoint of its own"
@@ -238,8 +237,7 @@ def _cameras(chosen: Mapping[str, str] | None) -> dict[str, str]:
 
 def _processor(path: Path) -> Any:
     processor = require("transformers").PI0Processor.from_pretrained(path, local_files_only=True)
-    absent = [name for name in _STATISTICS if getattr(processor, name) is None]
-    if absent:
+    if absent := [name for name in _STATISTICS if getattr(processor, name) is None]:
         raise ConfigError(
             f"checkpoint {path}: {_PROCESSOR} has no {absent}; want those of the dataset it was trained on: "
             f"PI0Processor(…, {absent[0]}=[…]).save_pretrained(folder) writes them"

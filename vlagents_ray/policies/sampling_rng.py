@@ -43,10 +43,14 @@ class RowDraws:
     """
 
     def __init__(self, rngs: Sequence[np.random.Generator], *models: Any) -> None:
-        """Prepare to draw from the generator of each row in the code of these objects, or modules."""
+        """Prepare to draw from the generator of each row in the code of these objects, or modules, from now on."""
         self._rngs, self._drawn = rngs, False
         for model in models:
-            _redirect(model)
+            names = [kind.__module__ for kind in type(model).__mro__]
+            modules: Iterable[Any] = [model] if isinstance(model, ModuleType) else map(sys.modules.get, names)
+            for module in modules:
+                if getattr(module, "torch", None) is torch and not module.__name__.startswith("torch."):
+                    module.torch = _TORCH
 
     def __enter__(self) -> Self:
         self._token: Token[RowDraws | None] = _DRAWS.set(self)
@@ -110,12 +114,3 @@ _TORCH = ModuleType("torch")
 vars(_TORCH).update(vars(torch), __getattr__=partial(getattr, torch))
 for _name in ("randn", "multinomial", "rand", "randint", "randn_like", "rand_like", "normal"):
     setattr(_TORCH, _name, partial(_draw, _name))
-
-
-def _redirect(model: Any) -> None:
-    """Have a module, or those that define an object's class, draw from the rows' generators from now on."""
-    names = [kind.__module__ for kind in type(model).__mro__]
-    modules: Iterable[Any] = [model] if isinstance(model, ModuleType) else map(sys.modules.get, names)
-    for module in modules:
-        if getattr(module, "torch", None) is torch and not module.__name__.startswith("torch."):
-            module.torch = _TORCH

@@ -115,8 +115,7 @@ def from_upstream(saved: Mapping[str, Any], config: VJepa2AcConfig) -> Any:
     transformers = require("transformers")
     tensors = _renamed(saved)
     width, _, tubelet, patch, _ = tensors[_PATCHES].shape
-    heads = config.encoder_heads or _HEADS.get(width)
-    if heads is None:
+    if (heads := config.encoder_heads or _HEADS.get(width)) is None:
         raise ConfigError(f"encoder_heads: unset, and {width} is the width of none of {sorted(_HEADS)}; set it")
     settings = transformers.VJEPA2Config(
         patch_size=patch,
@@ -421,8 +420,7 @@ class VJepa2Ac(ModelPolicy):
 
     def notice(self, obs: Obs) -> None:
         """Set the goal to that of an observation, if it has one; the features of an unchanged image are kept."""
-        image = obs.info.get(GOAL_IMAGE)
-        if image is None:
+        if (image := obs.info.get(GOAL_IMAGE)) is None:
             return
         if not isinstance(image, np.ndarray) or image.ndim != 3 or image.shape[2] != 3 or image.dtype != np.uint8:
             got = f"{image.shape} {image.dtype}" if isinstance(image, np.ndarray) else type(image).__name__

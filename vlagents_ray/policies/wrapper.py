@@ -25,8 +25,7 @@ class Wrapper(Agent, abc.ABC):
     """
 
     def __init__(self, agent: Agent, config: Any = None) -> None:
-        self.agent = agent
-        self.config = config
+        self.agent, self.config = agent, config
 
     @classmethod
     def around(cls, agent: Agent, settings: Mapping[str, Any]) -> Wrapper:

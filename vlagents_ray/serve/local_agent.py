@@ -96,12 +96,6 @@ class LocalAgent(Agent):
             acts.append(reply.error or reply.act or PolicyFailed("act: the policy answered without an action"))
         return acts
 
-    def act(self, obs: Obs) -> Act:
-        [act] = self.act_batch([obs], [self])
-        if isinstance(act, Exception):
-            raise act
-        return act
-
     def close(self) -> None:
         self._replies([self], [Request("close", rank="simulation")])
 

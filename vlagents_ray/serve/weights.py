@@ -489,10 +489,6 @@ class WeightUpdates:
         """Return the durations of the pushes since the last call."""
         return [self._pushes_ms.popleft() for _ in range(len(self._pushes_ms))]
 
-    def read_header(self, header: bytes, options: PushOptions) -> dict[str, ValueSpec]:
-        """Check the header of a push, as `ModelWeights.read_header` does."""
-        return self.own().read_header(header, options)
-
     def stage(self, number: int, pushed: Mapping[str, Any] | SharedValues, options: PushOptions) -> str:
         """Check and hold a new version, and return its fingerprint, as `ModelWeights.stage` does."""
         return self.own().stage(number, pushed, options, self._sessions)

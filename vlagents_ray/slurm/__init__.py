@@ -88,8 +88,7 @@ def _is_claimed(mark: Path, claim: dict[str, Any]) -> bool:
     try:
         mark.open("x").close()
     except FileExistsError:
-        since = _abandoned_since(mark)
-        if since is None:
+        if (since := _abandoned_since(mark)) is None:
             return False
         try:
             mark.with_suffix(f".{since}").open("x").close()  # by one of the processes that find this claim abandoned

@@ -172,10 +172,8 @@ def lookup(nested: Mapping[Any, Any], path: str) -> Any:
     end = path.find("/")
     while end >= 0:
         inside = nested.get(path[:end])
-        if isinstance(inside, Mapping):
-            value = lookup(inside, path[end + 1 :])
-            if value is not None:
-                return value
+        if isinstance(inside, Mapping) and (value := lookup(inside, path[end + 1 :])) is not None:
+            return value
         end = path.find("/", end + 1)
     return None
 
@@ -515,8 +513,7 @@ class KeyMapping:
         """Return the gripper's opening in [0, 1], 1 = open; None if it is missing, or invalid and not `needed`."""
         if (gripper := self.gripper) is None:
             return None
-        value = lookup(flat, gripper.key)
-        if value is None:
+        if (value := lookup(flat, gripper.key)) is None:
             if gripper.optional:
                 return None
             raise MissingState(gripper.key, have=keys(flat))

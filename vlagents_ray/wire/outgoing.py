@@ -60,8 +60,7 @@ class Outgoing:
         if not isinstance(theirs, Mapping):
             return _numbers("action", theirs)
         named = {name: _numbers(name, value) for name, value in theirs.items()}
-        ranges = self.mapping.action
-        if not ranges:
+        if not (ranges := self.mapping.action):
             if len(named) == 1:
                 return next(iter(named.values()))
             raise InvalidAction(

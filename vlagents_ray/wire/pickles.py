@@ -95,9 +95,7 @@ class _StackMachine:
     ) -> None:
         self._data = memoryview(data)
         self._at = 0
-        self._limits = limits
-        self._records = records
-        self._calls = calls
+        self._limits, self._records, self._calls = limits, records, calls
         self._items = 0
         self._stack: list[_StackValue] = []
         self._below: list[list[_StackValue]] = []  # the stacks below each open mark
@@ -108,8 +106,7 @@ class _StackMachine:
             raise MalformedMessage(f"pickle: want one of protocol {_PROTOCOLS[0]} or {_PROTOCOLS[1]}")
         while (opcode := self.take(1)[0]) != _STOP:
             self._count(1)
-            read = _OPCODES.get(opcode)
-            if read is None:
+            if (read := _OPCODES.get(opcode)) is None:
                 raise MalformedMessage(f"pickle: got opcode {opcode:#04x}, which is not read here")
             read(self)
         root = _finished(self.pop())
@@ -142,8 +139,7 @@ class _StackMachine:
             raise MalformedMessage(f"pickle: a text that is not UTF-8 ({error.reason})") from error
 
     def integer(self) -> None:
-        length = self.take(1)[0]
-        if length > _INTEGER:
+        if (length := self.take(1)[0]) > _INTEGER:
             raise MessageTooLarge(f"pickle: an integer of {length} bytes, the limit is {_INTEGER}")
         self.push(int.from_bytes(self.take(length), "little", signed=True))
 

@@ -116,8 +116,7 @@ def _read(document: Any, budget: Budget, segments: Segments) -> ObservationReque
         _require_known(top, _ROBOT_2, "observation")
         return ObservationRequest(_robot(top, "", budget, segments), None, ())
     _require_known(top, _TOP_3, "observation")
-    robots = _mapping(top["obs"], "observation.obs")
-    if not robots:
+    if not (robots := _mapping(top["obs"], "observation.obs")):
         raise InvalidObservation("observation.obs: got no robot, want one or more")
     if len(robots) > limits.cameras:
         raise MessageTooLarge(f"observation.obs: got {len(robots)} robots, the limit is {limits.cameras}")
@@ -134,8 +133,7 @@ def _read(document: Any, budget: Budget, segments: Segments) -> ObservationReque
         whole.state |= one.state
         whole.info |= one.info
         whole.gripper = one.gripper
-    goal = top.get("goal_image")
-    if goal is not None:
+    if (goal := top.get("goal_image")) is not None:
         kind = top.get("goal_image_data_type", RAW)
         whole.info[GOAL_IMAGE] = _image(goal, kind, GOAL_IMAGE, budget, segments)
     return ObservationRequest(whole, _instruction(top.get("language_instruction"), limits), tuple(robots))
@@ -155,8 +153,7 @@ def _robot(robot: Mapping[str, Any], prefix: str, budget: Budget, segments: Segm
     for name in _PARTS:
         if (part := robot.get(name)) is not None:
             obs.state[prefix + name] = _part(part, name, limits)
-    gripper = robot.get("gripper")
-    if gripper is not None:
+    if (gripper := robot.get("gripper")) is not None:
         if isinstance(gripper, np.ndarray) and gripper.size == 1:
             gripper = gripper.item()
         if not is_number(gripper):
@@ -207,8 +204,7 @@ def _shared(payload: Mapping[str, Any], budget: Budget, segments: Segments) -> n
         raise MalformedMessage("shared memory: want a name, and pixels of uint8")
     if not (isinstance(shape, list) and 0 < len(shape) <= 4 and all(type(n) is int and n > 0 for n in shape)):
         raise MalformedMessage(f"shared memory: got the shape {shown(shape)}, want (H, W, 3)")
-    size = math.prod(shape)
-    if size > budget.limits.body_bytes:
+    if (size := math.prod(shape)) > budget.limits.body_bytes:
         raise MessageTooLarge(f"shared memory: got {size} bytes, the limit is {budget.limits.body_bytes}")
     budget.hold(size)
     return read_array(memoryview(segments.read(name, size)), "|u1", shape)
@@ -261,8 +257,7 @@ def call(sequence: int, root: tuple[Any, ...], method: str, *args: str) -> bytes
 
 def read_result(body: bytes | bytearray, compressed: bool, limit: int) -> tuple[int, Any] | None:
     """Return a reply's sequence number, and its value or `RemoteError`; None if the message is not a reply."""
-    message = rpyc.read_reply(body, compressed, limit)
-    if message is None:
+    if (message := rpyc.read_reply(body, compressed, limit)) is None:
         return None
     sequence, ok, content = message
     if not ok:
@@ -317,8 +312,7 @@ def _row(robot: str, act: Any) -> np.ndarray:
         action = np.asarray(action)
     if not isinstance(action, np.ndarray) or action.ndim != 1 or action.dtype.kind not in "fiu":
         raise MalformedMessage(f"vlagents: action of {robot[:40]!r}: want (D,) numbers")
-    gripper = act.get("gripper")
-    if gripper is None:
+    if (gripper := act.get("gripper")) is None:
         return action
     if isinstance(gripper, np.ndarray) and gripper.size == 1:
         gripper = gripper.item()

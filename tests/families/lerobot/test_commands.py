@@ -26,7 +26,7 @@ from tests.families.lerobot import tiny
 from tests.families.lerobot.commands import Server, make_site, run, serving
 from vlagents_ray.contract import differences
 from vlagents_ray.errors import ConfigError, ContractMismatch
-from vlagents_ray.open_loop.recorded import Names, RecordedDataset
+from vlagents_ray.open_loop import Names, RecordedDataset
 
 TASK = "lift the cup"
 BY_RECORD = pytest.mark.skipif(tiny.NEW, reason="lerobot-record of LeRobot 0.6 takes no policy")

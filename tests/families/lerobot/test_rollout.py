@@ -22,7 +22,7 @@ from lerobot_policy_vlagents.modeling_vlagents import VlagentsPolicy
 from tests.families.lerobot.commands import Server, make_site, run, serving
 from tests.families.lerobot.test_commands import TASK, batch
 from vlagents_ray.errors import ConfigError
-from vlagents_ray.open_loop.recorded import Names, RecordedDataset
+from vlagents_ray.open_loop import Names, RecordedDataset
 
 HORIZON, CORRECTIONS = 12, 2
 

@@ -71,7 +71,7 @@ class Alone:
         async def others() -> tuple[()]:
             return ()
 
-        self.read_header = engine.weights.read_header
+        self.read_header = lambda *sent: engine.weights.own().read_header(*sent)
         self._pusher = WeightPusher(own, others)
         self.rest = self._pusher.rest
         self._engine = engine

@@ -51,8 +51,7 @@ class HttpTransport:
 
         With `machine` (see `MACHINE_HEADER`), prefer the least loaded replica on that machine.
         """
-        self._machine = machine
-        self._credentials = credentials
+        self._machine, self._credentials = machine, credentials
         self._url = http_url(url)
         self._codec = codec
         self._session = uuid.uuid4().hex

@@ -31,10 +31,7 @@ class AutoTransport:
     def __init__(
         self, url: str, codec: CodecChoice, credentials: Credentials = ANONYMOUS, *, only_shm: bool = False
     ) -> None:
-        self._credentials = credentials
-        self._url = url
-        self._codec = codec
-        self._only_shm = only_shm
+        self._credentials, self._url, self._codec, self._only_shm = credentials, url, codec, only_shm
         self._chosen: RequestChannel | None = None
         self._handle: HandleTransport | None = None  # in addition to a channel to the same replica
 

@@ -18,13 +18,7 @@ from vlagents_ray.errors import ConfigError, ConnectionLost, DeadlineExceeded, P
 from vlagents_ray.images.codecs import RAW
 from vlagents_ray.protocol.frames import decode_replies, encode_requests, request_parts
 from vlagents_ray.protocol.messages import LocalAddress, PlasmaAddress, Reply, Request, boot_id
-from vlagents_ray.ray_tools.private import (
-    channel_content,
-    node_of_this_process,
-    register_writer,
-    replica_request,
-    write_channel,
-)
+from vlagents_ray.ray_tools import private
 
 _PAUSE_S = 0.2  # s before requesting another replica in place of a lost one
 _QUERY_S = 10.0  # s between two queries for the replicas' nodes, which change over time
@@ -63,8 +57,7 @@ class HandleTransport:
 
         `must_be_near` accepts only a replica on this machine, even if others have far less load.
         """
-        self._must_be_near = must_be_near
-        self._app = app
+        self._must_be_near, self._app = must_be_near, app
         self._session = uuid.uuid4().hex
         self._replica: Any = None
 
@@ -196,7 +189,7 @@ def call_replica(replica: Any, method: Callable[..., Any], *args: Any, request_i
 
     `method` is one of `ClientApi`, or one of those between replicas.
     """
-    header = replica_request(request_id or uuid.uuid4().hex, method.__name__)
+    header = private.replica_request(request_id or uuid.uuid4().hex, method.__name__)
     return replica.handle_request.remote(header, *args)
 
 
@@ -233,14 +226,12 @@ class PlasmaTransport(UnixTransport):
 
     def connect_to(self, handle: HandleTransport, metadata: dict[str, Any], timeout_s: float) -> None:
         """Connect like `connect`, but to the replica that `handle` chose and whose metadata is passed."""
-        node = this_node()
-        if node is None:
+        if (node := this_node()) is None:
             raise ConfigError(
                 f"serve://{self._app}: transport 'plasma' needs a process on a node of the cluster; "
                 f"a Ray client (ray://) is none: use http://"
             )
-        address = metadata.get("plasma")
-        if address is None:
+        if (address := metadata.get("plasma")) is None:
             raise ConfigError(f"serve://{self._app}: its replica offers no plasma endpoint; use transport 'handle'")
         if address["node"] != node:
             raise ConfigError(
@@ -262,15 +253,15 @@ class PlasmaTransport(UnixTransport):
             for part in (request_parts(requests, RAW) if written is None else written.parts())
             for at in range(0, len(part), _CHUNK)
         )
-        frame = channel_content(PlasmaAddress.TAG, pieces)
+        frame = private.channel_content(PlasmaAddress.TAG, pieces)
         if frame.total_bytes > self._capacity:
             import ray
 
             key, self._capacity = self._handle.lease(frame.total_bytes, max(1e-3, deadline - time.monotonic()))
             # The id is sufficient: the replica owns the object, and keeps it as long as it lives.
             self._channel = ray.ObjectRef(key)
-            register_writer(self._channel)
-        if (reason := write_channel(self._channel, frame, _WRITE_MS)) is not None:
+            private.register_writer(self._channel)
+        if (reason := private.write_channel(self._channel, frame, _WRITE_MS)) is not None:
             raise OSError(f"the channel cannot be written ({reason})")
         self._unread = True
         flags = 0 if written is None else LocalAddress.COMPACT
@@ -291,7 +282,7 @@ class PlasmaTransport(UnixTransport):
 
 def this_node() -> str | None:
     """Return the id of the Ray node of this process; None for a Ray client, and without Ray."""
-    if node_of_this_process() is None:
+    if private.node_of_this_process() is None:
         return None
     import ray
 

@@ -229,8 +229,7 @@ class ShmTransport(UnixTransport):
         return len(self._memories) < LocalAddress.FILES or not all(memory.busy for memory in self._memories)
 
     def _write(self, requests: Sequence[Request], deadline: float) -> tuple[bytes, int | None]:
-        written = self._writer.write(requests)
-        if written is not None:
+        if (written := self._writer.write(requests)) is not None:
             memory, descriptor = self._memory(written.size)
             for at, array in written.arrays:
                 np.ndarray(array.shape, array.dtype, memory.map, at)[...] = array

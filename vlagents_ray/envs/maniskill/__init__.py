@@ -51,7 +51,7 @@ class ManiSkill(SimulatorEnv):
     and never reports `terminated`.
     """
 
-    suite = "maniskill"
+    suite, known = "maniskill", tuple(INSTRUCTIONS)
 
     def __init__(
         self,
@@ -109,10 +109,6 @@ class ManiSkill(SimulatorEnv):
         """Begin the episode of `seed`, taken modulo 2^32; `options` are passed to ManiSkill's own reset."""
         self._options = options or {}
         return super().reset(seed=seed)
-
-    @classmethod
-    def tasks(cls) -> list[str]:
-        return sorted(INSTRUCTIONS)
 
     @classmethod
     def require_task(cls, task: str | None) -> None:
@@ -173,9 +169,7 @@ class ManiSkillBatch(BatchEnv):
             )
         self.num_envs = num_envs
         self.max_steps, self._own_limit = step_limits(f"maniskill/{task}", task, max_steps)
-        self._task = task
-        self._instruction = instruction
-        self._reconfigure = reconfigure
+        self._task, self._instruction, self._reconfigure = task, instruction, reconfigure
         self._playing = self._steps = 0
         self._simulator = _simulator(task, num_envs=num_envs, sim_backend=sim_backend, **options)
         self._contract = self._simulator.contract(self._simulator.action)

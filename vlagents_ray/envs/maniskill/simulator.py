@@ -300,8 +300,7 @@ class Simulator:
         sensors: Mapping[str, Any],
     ) -> None:
         """Make the simulator, with `name` in errors; raises `ConfigError`, or `EnvFailed` with its cure."""
-        self.name = name
-        self._task = task
+        self.name, self._task = name, task
         self._asked_for = render_backend != "auto"
         self.env: Any = make_bare(
             task,

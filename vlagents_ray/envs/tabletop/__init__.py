@@ -54,6 +54,8 @@ class Tabletop(EvalEnv):
     The reward is 1.0 in each step that ends in success, else 0.0. Nothing terminates an episode.
     """
 
+    known = (MIXED, *_TASKS)
+
     def __init__(
         self,
         task: str | None = None,
@@ -112,10 +114,6 @@ class Tabletop(EvalEnv):
     @classmethod
     def require_task(cls, task: str | None) -> None:
         require_known("tabletop", task or MIXED, cls.tasks())
-
-    @classmethod
-    def tasks(cls) -> list[str]:
-        return [MIXED, *_TASKS]
 
     @classmethod
     def known_contract(cls, arguments: Mapping[str, Any]) -> Contract:

@@ -68,8 +68,7 @@ class TabletopRenderer:
     def draw(self, world: TabletopWorld) -> np.ndarray:
         """Return the image, (H, W, 3) uint8 RGB, as a new array."""
         resting = [p for p in world.pucks if p is not world.held]
-        key = tuple([(p.x, p.y, p.z) for p in resting])
-        if key != self._still_key:
+        if (key := tuple([(p.x, p.y, p.z) for p in resting])) != self._still_key:
             self._still, self._still_key = self._floor_picture.copy(), key
             for puck in sorted(resting, key=lambda p: (p.z, -p.y)):  # near ones over far ones, upper over lower
                 self._draw_puck_at(self._still, puck)
@@ -77,8 +76,7 @@ class TabletopRenderer:
         self._shade(image, self._gripper_shadow, world.x, world.y, world.z + _FINGER_LENGTH)
         if world.held is not None:
             self._draw_puck_at(image, world.held)
-        gap = round(world.gap * self._scale)
-        if gap not in self._grippers:
+        if (gap := round(world.gap * self._scale)) not in self._grippers:
             self._grippers[gap] = self._draw_gripper(float(gap))
         self._blend(image, self._grippers[gap], world.x, world.y, world.z)
         return image

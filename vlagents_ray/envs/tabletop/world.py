@@ -51,8 +51,7 @@ class TabletopWorld:
     """The state of one episode."""
 
     def __init__(self, pucks: list[Puck], pads: list[Pad]) -> None:
-        self.pucks = pucks
-        self.pads = pads
+        self.pucks, self.pads = pucks, pads
         self.x, self.y, self.z = HOME  # m, midway between the fingertips
         self.gap = GAP_OPEN  # m
         self.held: Puck | None = None
@@ -117,8 +116,7 @@ class TabletopWorld:
                 if abs(a.z - b.z) >= PUCK_HEIGHT - _EPSILON:
                     continue
                 still, loose = (b, a) if b is self.held else (a, b)
-                push = _overlap(loose, still.x, still.y, 2 * PUCK_RADIUS)
-                if push:
+                if push := _overlap(loose, still.x, still.y, 2 * PUCK_RADIUS):
                     loose.x += push[0]
                     loose.y += push[1]
                     moved = True
@@ -195,8 +193,7 @@ class TabletopWorld:
 def _overlap(puck: Puck, x: float, y: float, distance: float) -> tuple[float, float] | None:
     """Return the shift (dx, dy) that moves a puck to `distance` from (x, y); None if it is far enough away."""
     dx, dy = puck.x - x, puck.y - y
-    have = math.hypot(dx, dy)
-    if have >= distance - _EPSILON:
+    if (have := math.hypot(dx, dy)) >= distance - _EPSILON:
         return None
     if have < _EPSILON:
         return 0.0, -distance  # at the centre any direction is valid, as long as it is always the same

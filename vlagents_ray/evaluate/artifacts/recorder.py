@@ -18,14 +18,7 @@ from typing import Any
 import numpy as np
 
 from vlagents_ray.errors import ConfigError, EnvFailed, InvalidObservation
-from vlagents_ray.evaluate.artifacts.storage import (
-    TRAJECTORIES,
-    VIDEOS,
-    link_or_copy,
-    outcome,
-    require_there,
-    whole,
-)
+from vlagents_ray.evaluate.artifacts import storage
 from vlagents_ray.evaluate.episode.records import EpisodeObserver, EpisodeResult, version_of
 from vlagents_ray.evaluate.episode.second_pass import PlayedEpisode, SecondPass
 from vlagents_ray.evaluate.plan.cases import EvalCase
@@ -84,10 +77,10 @@ def save_videos(out: Path, cell: EvalCase, result: EpisodeResult, videos: dict[s
 
     Each file is complete once it has its name. Files of an earlier attempt at the episode are removed.
     """
-    folder, names, written = _folder_for(out, VIDEOS, cell, result), distinct(videos), []
+    folder, names, written = _folder_for(out, storage.VIDEOS, cell, result), distinct(videos), []
     for camera, data in videos.items():
-        path = folder / f"{_stem(result)}_{outcome(result)}_{names[camera]}.mp4"
-        with whole(path) as part:
+        path = folder / f"{_stem(result)}_{storage.outcome(result)}_{names[camera]}.mp4"
+        with storage.whole(path) as part:
             part.write_bytes(data)
         written.append(str(path.relative_to(out)))
     return written
@@ -142,7 +135,7 @@ class Trajectory:
         Raises:
             ConfigError: The file is missing, or is no trajectory.
         """
-        require_there(path)
+        storage.require_there(path)
         try:
             # Opened here: np.load leaves the file of a broken archive open.
             with path.open("rb") as opened, np.load(opened, allow_pickle=False) as file:
@@ -298,17 +291,17 @@ def save(out: Path, cell: EvalCase, result: EpisodeResult, kept: Artifacts) -> t
     shown are links, and the .npz is written last: if it exists, the other files do.
     """
     videos = save_videos(out, cell, result, kept.footage.shown)
-    folder = _folder_for(out, TRAJECTORIES, cell, result)
+    folder = _folder_for(out, storage.TRAJECTORIES, cell, result)
     if kept.trajectory is None:
         return videos, None
     path, saved = folder / f"{_stem(result)}.npz", dict(zip(kept.footage.shown, videos, strict=True))
     for camera, file in videos_of(path, kept.footage.seen).items():
         if camera in saved:
-            link_or_copy(out / saved[camera], file)
+            storage.link_or_copy(out / saved[camera], file)
         else:
-            with whole(file) as part:
+            with storage.whole(file) as part:
                 part.write_bytes(kept.footage.seen[camera])
-    with whole(path) as part:
+    with storage.whole(path) as part:
         part.write_bytes(kept.trajectory)
     return videos, str(path.relative_to(out))
 

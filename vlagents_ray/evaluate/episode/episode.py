@@ -20,14 +20,7 @@ from vlagents_ray.client.agent import RemoteAgent
 from vlagents_ray.contract import Contract
 from vlagents_ray.envs.base import BatchEnv, Environment
 from vlagents_ray.errors import CheckpointFailed, ConfigError, InvalidAction, PolicyFailed, VLAgentsError
-from vlagents_ray.evaluate.episode.failures import (
-    EnvStep,
-    checked_instruction,
-    checked_obs,
-    checked_step,
-    env_side,
-    policy_side,
-)
+from vlagents_ray.evaluate.episode import failures
 from vlagents_ray.evaluate.episode.latency import ChunkExecutor, Tick
 from vlagents_ray.evaluate.episode.records import Ending, EpisodeObserver, EpisodeResult, version_of
 from vlagents_ray.evaluate.plan.config import ClockConfig
@@ -98,7 +91,7 @@ class EpisodeStats:
         if latency_s is not None:
             self.latency_ms.append(1e3 * latency_s)
 
-    def stepped(self, tick: Tick, step: EnvStep, limit: int) -> bool:
+    def stepped(self, tick: Tick, step: failures.EnvStep, limit: int) -> bool:
         """Record that `tick` was executed; return whether the episode is over, also by the `limit` of steps."""
         self.steps += 1
         self.ticks_waited += tick.waited
@@ -146,7 +139,7 @@ Phase = Literal["idle", "connect", "make", "env reset", "policy reset", "policy 
 Outcome = EpisodeResult | VLAgentsError
 Watch = Callable[[Phase, int], None]  # called with the phase that begins and the number of steps so far
 
-_ACTING, _STEPPING = policy_side("act"), env_side("step")  # entered at each step
+_ACTING, _STEPPING = failures.policy_side("act"), failures.env_side("step")  # entered at each step
 
 
 @dataclass(frozen=True, slots=True)
@@ -204,14 +197,14 @@ def run_episodes(
         )
     watch("env reset", 0)
     begun = perf_counter()
-    with env_side("reset"):
+    with failures.env_side("reset"):
         contract = env.contract
         seen = env.reset(
             seeds=[key.seed for key in keys],
             options=[options_of_reset(env, key.episode, settings.reset_options) for key in keys],
         )
         first = [
-            (checked_obs(obs, contract, "reset"), checked_instruction(text, "reset"))
+            (failures.checked_obs(obs, contract, "reset"), failures.checked_instruction(text, "reset"))
             for obs, text in zip(seen, env.instructions, strict=True)
         ]
     reset_ms = 1e3 * (perf_counter() - begun)
@@ -269,7 +262,7 @@ class _Episode:
     def began(self, answer: dict[str, Any] | Exception) -> None:
         """Begin with the policy's answer to the reset of the session."""
         try:
-            with policy_side("reset"):
+            with failures.policy_side("reset"):
                 if isinstance(answer, Exception):
                     raise answer
                 self.stats.began(answer)
@@ -305,7 +298,7 @@ class _Episode:
         except VLAgentsError as error:
             self.failed(error)
 
-    def stepped(self, step: EnvStep, limit: int) -> None:
+    def stepped(self, step: failures.EnvStep, limit: int) -> None:
         """Record the outputs of the next of `ticks`."""
         self.observer.add_observation(step.obs)
         self.obs, tick = step.obs, self.ticks.popleft()
@@ -329,7 +322,7 @@ def _instructed(env: BatchEnv, playing: Sequence[_Episode]) -> list[_Episode]:
         texts = env.instructions if playing else []
         found = [one for one in playing if texts[one.number] != one.stats.instruction]
         for episode in found:
-            episode.instructed(checked_instruction(texts[episode.number], "step"))
+            episode.instructed(failures.checked_instruction(texts[episode.number], "step"))
     return found
 
 
@@ -390,7 +383,7 @@ def _step(env: BatchEnv, episodes: Sequence[_Episode], playing: Sequence[_Episod
     took_ms = 1e3 * (perf_counter() - begun)
     for episode, obs, reward, terminated, truncated, info in answers:
         if episode.outcome is None:
-            step = checked_step(obs, reward, terminated, truncated, info, contract, images=env.looked_at)
+            step = failures.checked_step(obs, reward, terminated, truncated, info, contract, images=env.looked_at)
             episode.stats.step_ms.append(took_ms)
             episode.stepped(step, env.max_steps)
 

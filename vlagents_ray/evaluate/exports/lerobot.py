@@ -91,8 +91,7 @@ def to_lerobot(
     if not recorded:
         raise ConfigError(f"{results.out}: has no trajectories; evaluate with --record all (`record: all` in its file)")
     if successes:
-        solved = [(cell, one) for cell, one in recorded if one.result.success_once]
-        if not solved:
+        if not (solved := [(cell, one) for cell, one in recorded if one.result.success_once]):
             raise ConfigError(f"{results.out}: in none of the {len(recorded)} recorded episodes was the task solved")
         recorded = solved
     if path.exists() and any(path.iterdir()):

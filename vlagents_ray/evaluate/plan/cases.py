@@ -152,8 +152,7 @@ def cells(config: EvalConfig) -> list[EvalCase]:
         raise ConfigError(f"suites: {twice} are in two suites of one name; give each suite another `name`")
     folders: dict[tuple[str, ...], tuple[str, ...]] = {}
     for name in names:
-        other = folders.setdefault(tuple(plain(part) for part in name), name)
-        if other != name:
+        if (other := folders.setdefault(tuple(plain(part) for part in name), name)) != name:
             raise ConfigError(f"{' '.join(name)!r} and {' '.join(other)!r} would share files; give one another name")
     prints = Counter(cell.fingerprint for cell in found)
     if twice := sorted({cell.env for cell in found if prints[cell.fingerprint] > 1}):

@@ -94,8 +94,7 @@ class Gallery:
     """Chooses which videos the report embeds or links, within a size budget."""
 
     def __init__(self, results: Results, page: Path, *, inline: bool, budget: int = BUDGET) -> None:
-        self._results = results
-        self._page = page
+        self._results, self._page = results, page
         self._budget = budget if inline else 0
         self.inlined = 0
         self.linked = 0
@@ -116,8 +115,7 @@ class Gallery:
 
     def player(self, video: str, label: str) -> Player | None:
         """Return a player for `video`, a path of an episode; None if the file is missing."""
-        path = self._file(video)
-        if path is None:
+        if (path := self._file(video)) is None:
             return None
         size, frame = path.stat().st_size, last_frame(path)
         if size <= self._budget:
@@ -150,8 +148,7 @@ def episodes(results: Results, gallery: Gallery) -> Episodes | None:
     """Return all episodes, or None without any."""
     order = {name: index for index, name in enumerate(results.contenders)}
     cells = sorted(results.cells, key=lambda cell: order[cell.contender])
-    found = [(cell, one) for cell in cells for one in cell.episodes]
-    if not found:
+    if not (found := [(cell, one) for cell in cells for one in cell.episodes]):
         return None
     solved = [(cell, one) for cell, one in found if one.counts and one.result.success_once]
     cards = gallery.cards(solved, MOST_SOLVED)

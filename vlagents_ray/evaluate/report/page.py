@@ -156,8 +156,7 @@ def latency(summary: Summary) -> Latency | None:
     """Return the latencies; None if no episode was played."""
     results = summary.results
     by_name = {name: [one for cell in results.of(name) for one in cell.counted] for name in results.contenders}
-    played = {name: counted for name, counted in by_name.items() if counted}
-    if not played:
+    if not (played := {name: counted for name, counted in by_name.items() if counted}):
         return None
     spent: dict[str, dict[str, float]] = {}
     for name, counted in played.items():

@@ -127,8 +127,7 @@ def _learning_curve(title: str, cells: Sequence[CellResults]) -> LearningCurve |
             without_steps.setdefault(cell.policy, []).append(cell)
         else:
             by_policy.setdefault(cell.policy, {}).setdefault(cell.step, []).append(cell)
-    swept = {policy: found for policy, found in by_policy.items() if len(found) > 1}
-    if not swept:
+    if not (swept := {policy: found for policy, found in by_policy.items() if len(found) > 1}):
         return None
     lines = [
         Series(policy, [(step, _rate(policy, group)) for step, group in sorted(found.items())])

@@ -63,8 +63,7 @@ def policy_changes(subject: str, known: Mapping[str, Any], now: Mapping[str, Any
 
 def policy_program(metadata: Mapping[str, Any], *, swept: bool) -> dict[str, str] | None:
     """Return the program in the metadata of a policy's server, or None."""
-    program = metadata.get("program")
-    if program is None:
+    if (program := metadata.get("program")) is None:
         return None
     return {name: value for name, value in program.items() if not (swept and name.startswith(_SWEPT))}
 

@@ -140,8 +140,7 @@ def _by_suite(results: Results, a: str, b: str) -> dict[str, Strata]:
     others = {(cell.suite, cell.env): cell for cell in results.of(b)}
     found: dict[str, Strata] = {}
     for cell in results.of(a):
-        other = others.get((cell.suite, cell.env))
-        if other is None:
+        if (other := others.get((cell.suite, cell.env))) is None:
             continue
         _require_same_env(cell, other)
         pairs = _pairs(cell, other)

@@ -80,8 +80,7 @@ def require_readable(out: Path, db: sqlite3.Connection) -> None:
             raise ConfigError(
                 f"{out / FILE}: got {name!r}, which is a {kind} that no evaluation makes: do not trust its author"
             )
-    version = db.execute("PRAGMA user_version").fetchone()[0]
-    if version != VERSION:
+    if (version := db.execute("PRAGMA user_version").fetchone()[0]) != VERSION:
         raise ConfigError(f"{out / FILE}: got version {version} of the results, want {VERSION}; choose another folder")
     for table, known in _known_columns().items():
         there = _columns(db, table)

@@ -191,8 +191,7 @@ def difference_interval(strata: Sequence[Pairs]) -> tuple[float, float]:
     Returns:
         (low, high) of the success rate of A minus that of B, each in [-1, 1]; (-1, 1) without episodes.
     """
-    n = sum(one.total for one in strata)
-    if n == 0:
+    if (n := sum(one.total for one in strata)) == 0:
         return -1.0, 1.0
     turns = np.exp(2j * np.pi * np.arange(2 * n + 1) / (2 * n + 1))  # (2n + 1,), one for each sum from -n to n
     transformed = np.ones_like(turns)
@@ -273,8 +272,7 @@ def pooled(counts: Sequence[tuple[int, int]], error_rate: float) -> tuple[float,
     of the error rate: then all their bounds hold at once, and so does any weighted mean.
     """
     counts = [one for one in counts if one[1]]
-    total = sum(trials for _, trials in counts)
-    if not total:
+    if not (total := sum(trials for _, trials in counts)):
         return 0.0, 1.0
     bounds = [(*confidence_sequence(s, n, error_rate / len(counts)), n / total) for s, n in counts]
     return sum(low * share for low, _, share in bounds), sum(high * share for _, high, share in bounds)

@@ -233,8 +233,7 @@ class Store(AbstractContextManager["Store"]):
             return
         self._made.add(cell.place)
         query = "SELECT described, contract FROM cells WHERE cell = ? AND described IS NOT NULL"
-        known = self._db.execute(query, (cell.fingerprint,)).fetchone()
-        if known is None:
+        if (known := self._db.execute(query, (cell.fingerprint,)).fetchone()) is None:
             return
         now = (json.loads(json.dumps(made.described, default=str)), json.loads(canonical(made.contract)))
         odd = [
@@ -266,8 +265,7 @@ class Store(AbstractContextManager["Store"]):
     def _open(self, config: EvalConfig) -> sqlite3.Connection:
         db = sqlite3.connect(self._out / FILE, timeout=WAIT_S)  # by default each commit reaches the disk
         try:
-            version = db.execute("PRAGMA user_version").fetchone()[0]
-            if version == 0:
+            if db.execute("PRAGMA user_version").fetchone()[0] == 0:
                 db.executescript(f"BEGIN; {SCHEMA} PRAGMA user_version = {VERSION}; COMMIT;")
             require_readable(self._out, db)
             self._require_resumable(db, config)
@@ -301,8 +299,7 @@ class Store(AbstractContextManager["Store"]):
                 f"{self._out} already has results ({episodes} episodes): resume them (--resume), "
                 f"or choose another out folder"
             )
-        found = [f"- {text}" for cell in self.cells for text in _differences(db, cell)]
-        if found:
+        if found := [f"- {text}" for cell in self.cells for text in _differences(db, cell)]:
             odd = "\n".join(found)
             raise ConfigError(
                 f"{self._out} has results of other settings:\n{odd}\n"
@@ -311,8 +308,7 @@ class Store(AbstractContextManager["Store"]):
         lacking, programs = self._other_plan(db), dict[Change, None]()
         for cell in self.cells:
             query = "SELECT program FROM cells WHERE env = ? AND program IS NOT NULL AND cell = ?"
-            row = db.execute(query, (cell.env, cell.fingerprint)).fetchone()
-            if row is not None:
+            if (row := db.execute(query, (cell.env, cell.fingerprint)).fetchone()) is not None:
                 programs |= dict.fromkeys(program_changes(f"env {cell.env}", json.loads(row[0]), cell.program))
         self._accept_or_raise(
             "plan",

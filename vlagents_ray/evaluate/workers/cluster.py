@@ -125,8 +125,7 @@ class CapacityMonitor:
     """
 
     def __init__(self, config: EvalConfig, now: Callable[[], float] = monotonic) -> None:
-        self._config = config
-        self._now = now
+        self._config, self._now = config, now
         self._last_played = now()  # time at which an episode was last being played
         self._warned = False  # whether the user was warned that there is no room for all
 

@@ -46,8 +46,7 @@ class WorkerPool(Workers):
 
     def __init__(self, config: EvalConfig, agent_factory: AgentFactory, recorders: RecorderFactory = Recording) -> None:
         super().__init__()
-        self._config = config
-        self._recorders = recorders
+        self._config, self._recorders = config, recorders
         self._actor_class = ray.remote(concurrency_groups={"watch": 1})(Rollout)
         self._agent_factory = agent_factory
         # from this process's environment, which workers on other nodes do not inherit
@@ -83,8 +82,7 @@ class WorkerPool(Workers):
             return False
         if len(self._workers) < (self._config.workers or 1):
             return True
-        idle = self.idle()
-        if not idle:
+        if not (idle := self.idle()):
             return False
         self._workers.remove(idle[0])
         idle[0].actor.close.remote()  # frees its simulator; some need that for a clean exit
@@ -132,8 +130,7 @@ class WorkerPool(Workers):
         yield from self._check_workers()
 
     def close(self) -> None:
-        closing = {worker.actor.close.remote(): worker for worker in self.idle()}
-        if not closing:
+        if not (closing := {worker.actor.close.remote(): worker for worker in self.idle()}):
             return
         done, late = ray.wait(list(closing), num_returns=len(closing), timeout=CLOSE_S)
         for ref in done:
@@ -204,8 +201,7 @@ class WorkerPool(Workers):
                 if self._capacity.timed_out(worker.started_at) and self._head.answers():
                     self._capacity.report_shortage(worker.config, sum(one.starting is None for one in self._workers))
             elif worker.jobs:
-                reason = self._overdue(worker, now)
-                if reason is not None:
+                if (reason := self._overdue(worker, now)) is not None:
                     self._kill_worker(worker)
                     failure = self._with_log(Failure("worker", EnvFailed.code, reason, worker.heartbeat.stack), worker)
                     yield from ((job, Report(failure=failure)) for job in worker.jobs)

@@ -29,13 +29,7 @@ from vlagents_ray.envs.base import BatchEnv, SequentialBatch, make_batch
 from vlagents_ray.envs.graphics import require_own
 from vlagents_ray.errors import ConfigError, EnvFailed, MissingDependency, VLAgentsError
 from vlagents_ray.evaluate.artifacts.recorder import Artifacts, EpisodeRecorder, RecorderFactory, Recording
-from vlagents_ray.evaluate.episode.episode import (
-    EpisodeSettings,
-    Phase,
-    options_of_reset,
-    run_episodes,
-    transport_of,
-)
+from vlagents_ray.evaluate.episode import episode
 from vlagents_ray.evaluate.episode.failures import Failure, env_side, explain, policy_side
 from vlagents_ray.evaluate.episode.records import EnvInfo, EpisodeResult, WorkerInfo
 from vlagents_ray.evaluate.plan.cases import EvalCase, env_program
@@ -84,7 +78,7 @@ class Report:
 class Heartbeat:
     """A worker's current phase, and how long it has lasted."""
 
-    phase: Phase
+    phase: episode.Phase
     age_s: float
     steps: int
     stack: str = ""  # the stack, if the phase has lasted for long
@@ -94,9 +88,7 @@ class Rollout:
     """Plays jobs. Keeps its agent and its environment until a job needs another."""
 
     def __init__(self, config: EvalConfig, agent_factory: AgentFactory, recorders: RecorderFactory = Recording) -> None:
-        self._config = config
-        self._agent_factory = agent_factory
-        self._recorders = recorders
+        self._config, self._agent_factory, self._recorders = config, agent_factory, recorders
         self._agent: Agent | None = None
         self._policy: str | None = None  # the policy of the agent
         self._described: dict[str, Any] = {}  # of an agent without a server: its weights
@@ -107,7 +99,7 @@ class Rollout:
         self._repeatable = True  # as far as is known of the environment
         self._surplus = 0  # successes over failures in this environment
         self._thread = 0  # id of the thread that plays
-        self._current_phase: tuple[Phase, float, int] = ("idle", monotonic(), 0)
+        self._current_phase: tuple[episode.Phase, float, int] = ("idle", monotonic(), 0)
 
     def ready(self, credentials: Credentials) -> dict[str, Any]:
         """Return the process's host and id, and its log files, as soon as it runs.
@@ -167,17 +159,19 @@ class Rollout:
             if (renderer := env.renderer()) is not None:
                 require_own(renderer)
             name, where = None if renderer is None else renderer.name, (socket.gethostname(), this_node(), os.getpid())
-            found["worker"] = WorkerInfo(*where, cell.policy.name, transport_of(agent), name)
+            found["worker"] = WorkerInfo(*where, cell.policy.name, episode.transport_of(agent), name)
         with contextlib.ExitStack() as stack:
             made = (self._recorders(self._config, env.contract.control_hz) for _ in jobs)
             recordings = [stack.enter_context(contextlib.closing(one)) for one in made]
             wanted = recordings[0].wants_images
-            outcomes = run_episodes(
+            outcomes = episode.run_episodes(
                 env,
                 agent,
                 self._sessions_of(agent, env, len(jobs)),
                 [job.key for job in jobs],
-                EpisodeSettings(cell.policy.execute, cell.suite.clock, cell.suite.reset_options, cell.policy_options),
+                episode.EpisodeSettings(
+                    cell.policy.execute, cell.suite.clock, cell.suite.reset_options, cell.policy_options
+                ),
                 observers=recordings,
                 watch=self._set_phase,
                 images=wanted == "all" or (wanted == "failures" and self._renders_at_once(agent, env, cell.policy)),
@@ -191,7 +185,7 @@ class Rollout:
 
     def _finished(self, env: BatchEnv, job: Job, result: EpisodeResult, recording: EpisodeRecorder) -> Artifacts:
         """Return the artifacts of an episode; if images are missing, play it again."""
-        options = options_of_reset(env, job.key.episode, job.cell.suite.reset_options)
+        options = episode.options_of_reset(env, job.key.episode, job.cell.suite.reset_options)
         kept = recording.finish(
             result, lambda played, record: played.play_again(env, job.key.seed, options, self._set_phase, record)
         )
@@ -211,14 +205,13 @@ class Rollout:
     def _sessions_of(self, agent: Agent, env: BatchEnv, number: int) -> list[Agent]:
         if env.num_envs == 1:
             return [agent]
-        sessions = getattr(agent, "sessions", None)
-        if sessions is None:
+        if (sessions := getattr(agent, "sessions", None)) is None:
             raise ConfigError("num_envs: got more than 1 for a policy in the worker's own process; give it a `url`")
         if number > len(self._sessions):
             self._sessions += sessions(number - len(self._sessions))
         return self._sessions[:number]
 
-    def _set_phase(self, phase: Phase, steps: int) -> None:
+    def _set_phase(self, phase: episode.Phase, steps: int) -> None:
         self._current_phase = (phase, monotonic(), steps)
 
     def _connect(self, policy: PolicyConfig) -> Agent:
@@ -251,8 +244,7 @@ class Rollout:
                 else:
                     env = make_batch(cell.env, number, **options)
         except EnvFailed as error:
-            reason = env_class(cell.env).missing()
-            if reason is None:
+            if (reason := env_class(cell.env).missing()) is None:
                 raise
             raise MissingDependency(f"env {cell.env!r} cannot run here: {reason}") from error
         self._place = cell.place

@@ -64,13 +64,11 @@ def find_checkpoint(name: str, step: int | None = None, needs: Iterable[str] = (
         if name.startswith((".", "/", "~")) or name.partition("@")[0].count("/") != 1:
             raise ConfigError(f"checkpoint {name!r}: no such file or folder; have {_beside(path)}")
         path = _from_hub(name)
-    if path.is_dir():
-        missing = [pattern for pattern in needs if not any(path.glob(pattern))]
-        if missing:
-            raise ConfigError(
-                f"checkpoint {path}: misses {missing}, has {sorted(p.name for p in path.iterdir())[:20]}; "
-                f"is it a checkpoint of this family, and whole?"
-            )
+    if path.is_dir() and (missing := [pattern for pattern in needs if not any(path.glob(pattern))]):
+        raise ConfigError(
+            f"checkpoint {path}: misses {missing}, has {sorted(p.name for p in path.iterdir())[:20]}; "
+            f"is it a checkpoint of this family, and whole?"
+        )
     if (used := _used.get()) is not None and path not in used:
         used[:] = [*(one for one in used if not _holds(one, path)), path]
     return path
@@ -191,8 +189,7 @@ class SavedTensors:
 def _safetensors(folder: Path) -> list[Path]:
     for index in sorted(folder.glob(f"*{_INDEX}")):
         names = set(json.loads(index.read_text(encoding="utf-8"))["weight_map"].values())
-        absent = sorted(name for name in names if not (folder / name).is_file())
-        if absent:
+        if absent := sorted(name for name in names if not (folder / name).is_file()):
             raise ConfigError(f"checkpoint {folder}: {index.name} names {absent}, which are missing; copy all of it")
         return [folder / name for name in sorted(names)]
     found = sorted(folder.glob("*.safetensors"))

@@ -40,8 +40,7 @@ def unfinished(path: Path) -> str | None:
     """
     try:
         entries = [path, *sorted(path.rglob("*"))] if path.is_dir() else [path]
-        files = [entry for entry in entries if entry.is_file()]
-        if not files:
+        if not (files := [entry for entry in entries if entry.is_file()]):
             return f"{path.name}: no file is there"
         if all(file.suffix in _TEXT for file in files):
             return f"{path.name}: holds no weights, only {[file.name for file in files]}"
@@ -49,8 +48,7 @@ def unfinished(path: Path) -> str | None:
             if any(fnmatch.fnmatchcase(entry.name, pattern) for pattern in TEMPORARY):
                 return f"{entry.name}: its name is a temporary one"
         for file in files:
-            trouble = _trouble(file)
-            if trouble is not None:
+            if (trouble := _trouble(file)) is not None:
                 return f"{file.name}: {trouble}"
     except FileNotFoundError as error:
         return f"{error.filename}: went away while it was looked at"
@@ -198,8 +196,7 @@ def _header(opened: BinaryIO) -> tuple[bytes, list[tuple[int, int]]] | None:
 
     Returns None if the file has another format.
     """
-    length = int.from_bytes(opened.read(8), "little")
-    if length > _LONGEST_HEADER:
+    if (length := int.from_bytes(opened.read(8), "little")) > _LONGEST_HEADER:
         return None
     text = opened.read(length)
     try:

@@ -138,8 +138,7 @@ def state_specs(parts: Sequence[str], dim: int | None = None) -> dict[str, State
 
 
 def wanted_samples(obs: Obs, config: ModelConfig) -> int:
-    samples = count_in(obs, SAMPLES)
-    if samples > config.max_samples:
+    if (samples := count_in(obs, SAMPLES)) > config.max_samples:
         raise InvalidObservation(
             f"info[{SAMPLES!r}]: got {samples}, want at most {config.max_samples}; ask for fewer, or set the policy's "
             f"`max_samples`"

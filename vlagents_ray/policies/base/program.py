@@ -48,8 +48,7 @@ def code_of_class(target: str) -> Program:
     found: Program = {}
     waiting, seen = [module], set()
     while waiting:
-        name = waiting.pop()
-        if name in seen:
+        if (name := waiting.pop()) in seen:
             continue
         seen.add(name)
         if "." in name:
@@ -87,8 +86,7 @@ def files_named(settings: Mapping[str, Any], *, folders: bool = True) -> Program
     step = settings.get("checkpoint_step")
     found: Program = {}
     for name, text in _texts(settings):
-        path = _existing(at_step(text, step) if isinstance(step, int) else text)
-        if path is None:
+        if (path := _existing(at_step(text, step) if isinstance(step, int) else text)) is None:
             continue
         if path.is_file():
             found[f"{name}: {path}"] = digest([path])
@@ -156,8 +154,7 @@ def _imports(source: bytes, package: str) -> Iterator[str]:
             yield from (alias.name for alias in node.names)
         elif isinstance(node, ast.ImportFrom):
             parts = package.split(".")[: len(package.split(".")) - node.level + 1] if node.level else []
-            base = ".".join([*parts, *([node.module] if node.module else [])])
-            if base:
+            if base := ".".join([*parts, *([node.module] if node.module else [])]):
                 yield base
                 yield from (f"{base}.{alias.name}" for alias in node.names if alias.name != "*")
 

@@ -35,8 +35,7 @@ class Expert(Protocol):
 
 def expert_class(env_name: str) -> type[Expert]:
     """Return the expert for an env, e.g. "tabletop/slide"; raises `ContractMismatch` if there is none."""
-    target = EXPERTS.get(env_name) or EXPERTS.get(env_suite(env_name))
-    if target is None:
+    if (target := EXPERTS.get(env_name) or EXPERTS.get(env_suite(env_name))) is None:
         raise ContractMismatch(
             f"no scripted expert for env {env_name!r}: there are experts for {sorted(EXPERTS)}; choose one of these "
             f"envs, set `expert` to one of examples/experts, 'experts.pusht:PushTExpert', or choose another policy"

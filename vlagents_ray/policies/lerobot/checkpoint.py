@@ -33,8 +33,7 @@ def find(config: LeRobotConfig) -> Path:
         folder /= TRAINED
     _require_no_nvidia(folder / "config.json")
     folder = find_checkpoint(str(folder.resolve()), needs=["config.json", WEIGHTS])
-    missing = [name for name in PIPELINES if not (folder / name).is_file()]
-    if missing:
+    if missing := [name for name in PIPELINES if not (folder / name).is_file()]:
         raise ConfigError(
             f"checkpoint {folder}: misses {missing}, with the normalisation; convert a checkpoint from before LeRobot "
             f"had processors by: python -m lerobot.processor.migrate_policy_normalization "
@@ -81,8 +80,7 @@ def _settings(folder: Path, config: LeRobotConfig) -> Any:
     try:
         settings = base.from_pretrained(folder)
         known = {one.name for one in dataclasses.fields(settings)}
-        unknown = sorted(set(config.overrides) - known)
-        if unknown:
+        if unknown := sorted(set(config.overrides) - known):
             raise ConfigError(f"overrides: got {unknown}, want some of {sorted(known)}")
         words = [f"--{name}={json.dumps(value)}" for name, value in config.overrides.items()]
         return base.from_pretrained(folder, cli_overrides=words) if words else settings
@@ -185,8 +183,7 @@ def _as_loaded(policy: Any, saved: SavedTensors) -> SavedTensors | Mapping[str, 
 
 def _renamed(policy: Any, name: str) -> list[str]:
     """Return LeRobot's names of a saved tensor; empty if it drops the tensor."""
-    fix = getattr(policy, "_fix_pytorch_state_dict_keys", None)
-    if fix is None:
+    if (fix := getattr(policy, "_fix_pytorch_state_dict_keys", None)) is None:
         return [name]
     found = fix({name: require("torch").empty(0)}, policy.config)
     return [new if new.startswith("model.") else f"model.{new}" for new in found]

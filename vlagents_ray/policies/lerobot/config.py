@@ -78,8 +78,7 @@ def refusal(name: str) -> str | None:
     ours = "0.6.1" if is_new() else "0.4.4"
     if reason := _REWARDS.get(name) or _REFUSED[ours].get(name):
         return reason
-    theirs = _ONLY_IN.get(name, ours)
-    if theirs == ours:
+    if (theirs := _ONLY_IN.get(name, ours)) == ours:
         return None
     other = "; LeRobot 0.6 calls that gaussian_actor, and does not read it" if name == "sac" else ""
     return f"LeRobot {installed()}, the one here, does not have it{other}; {reads(theirs)}"

@@ -14,28 +14,13 @@ from vlagents_ray.contract import ActionSpec, CameraSpec, Contract
 from vlagents_ray.dataset_contract import DatasetContract, angles_in, centre_between, usual_unit
 from vlagents_ray.errors import ConfigError
 from vlagents_ray.interface import Obs
-from vlagents_ray.policies.base import ModelPolicy, Prediction, Row
+from vlagents_ray.policies.base import ModelPolicy, Prediction, Row, model_inputs
 from vlagents_ray.policies.base.accelerator import torch_device
 from vlagents_ray.policies.base.model_code import remote_code
-from vlagents_ray.policies.base.model_inputs import (
-    GRIPPER,
-    camera_images,
-    choose_cameras,
-    needs_gripper,
-    state_specs,
-    state_vector,
-)
 from vlagents_ray.policies.base.staging import StagedRow
 from vlagents_ray.policies.flow import OFFERED
-from vlagents_ray.policies.lerobot import checkpoint
+from vlagents_ray.policies.lerobot import checkpoint, kinds
 from vlagents_ray.policies.lerobot.config import LeRobotConfig
-from vlagents_ray.policies.lerobot.kinds import (
-    KINDS,
-    MASKING,
-    RESIZING,
-    Flow,
-    Kind,
-)
 from vlagents_ray.policies.lerobot.processors import STATE, Processors, own_processors
 from vlagents_ray.policies.outcomes import attempt
 from vlagents_ray.registry import require
@@ -45,7 +30,7 @@ log = logging.getLogger(__name__)
 ENVIRONMENT = "observation.environment_state"
 JOINTS, ENVIRONMENT_STATE = "joints", "environment_state"  # default parts of `Obs.state`
 _MATCHED = ("min", "max", "mean")  # statistics by which the parts of a state are located in it
-_FLOWS = sorted(name for name in KINDS if issubclass(KINDS[name], Flow))
+_FLOWS = sorted(name for name in kinds.KINDS if issubclass(kinds.KINDS[name], kinds.Flow))
 _EMPTY = "empty_camera_"  # prefix of cameras that were always masked in training
 
 
@@ -53,7 +38,7 @@ _EMPTY = "empty_camera_"  # prefix of cameras that were always masked in trainin
 class LoadedLeRobot:
     """A loaded checkpoint, shared by all sessions."""
 
-    kind: Kind
+    kind: kinds.Kind
     processors: Processors
     cameras: dict[str, str]  # the policy's observation key -> our name
     state: list[str]  # parts of the proprioception; empty if the policy has no state
@@ -79,7 +64,7 @@ class LeRobot(ModelPolicy):
     @property
     def continues_plans(self) -> bool:
         loaded: LoadedLeRobot | None = self.model
-        flows = loaded is not None and isinstance(loaded.kind, Flow) and loaded.processors.invertible
+        flows = loaded is not None and isinstance(loaded.kind, kinds.Flow) and loaded.processors.invertible
         return flows and self.config.actions == "chunk"
 
     @property
@@ -104,13 +89,13 @@ class LeRobot(ModelPolicy):
     def _loaded(self, folder: Path) -> LoadedLeRobot:
         policy = checkpoint.load(folder, self.config, torch_device(self.config.device))
         settings = policy.config
-        kind = KINDS.get(settings.type, Kind)(policy, self.compilation)
+        kind = kinds.KINDS.get(settings.type, kinds.Kind)(policy, self.compilation)
         if self.config.compile not in (False, "auto") and not self.compilation.cores:
             raise ConfigError(
                 f"compile: not for LeRobot's {settings.type!r}; leave it out, or have LeRobot compile it, where its "
                 f"config has that: overrides: {{compile_model: true}}"
             )
-        if isinstance(kind, Flow):
+        if isinstance(kind, kinds.Flow):
             kind.noise_level, kind.passes.adapters = self.config.noise_level, self.adapters
         elif self.config.adapters:
             raise ConfigError(
@@ -126,7 +111,7 @@ class LeRobot(ModelPolicy):
         return self._described(kind, processors, _trained(settings, processors), processors.rename_map)
 
     def _described(
-        self, kind: Kind, processors: Processors, trained: DatasetContract, renames: dict[str, str]
+        self, kind: kinds.Kind, processors: Processors, trained: DatasetContract, renames: dict[str, str]
     ) -> LoadedLeRobot:
         """Return the loaded checkpoint with the contract that follows from its training."""
         settings = kind.config
@@ -137,14 +122,14 @@ class LeRobot(ModelPolicy):
         environment = list(trained.environment or [ENVIRONMENT_STATE]) if settings.env_state_feature else []
         width = processors.width(kind.dim)
         action, known = trained.contract.action, trained.contract.state or {}
-        state = state_specs(parts, settings.robot_state_feature.shape[0]) if parts else {}
+        state = model_inputs.state_specs(parts, settings.robot_state_feature.shape[0]) if parts else {}
         if tuple(parts) == trained.state:
             state |= known
-        around = state_specs(environment, settings.env_state_feature.shape[0]) if environment else {}
+        around = model_inputs.state_specs(environment, settings.env_state_feature.shape[0]) if environment else {}
         contract = Contract(
             cameras={ours: _camera(settings, key) for key, ours in cameras.items()},
             state=state | {part: known.get(part, spec) for part, spec in around.items()},
-            gripper=needs_gripper(parts),
+            gripper=model_inputs.needs_gripper(parts),
             instruction=processors.instructed or None,
             action=action if action.dim == width else ActionSpec(dim=width),
             control_hz=trained.contract.control_hz,
@@ -178,11 +163,11 @@ class LeRobot(ModelPolicy):
 
     def perceive(self, obs: Obs) -> StagedRow:
         model: LoadedLeRobot = self.model
-        frame = {key: image.copy() for key, image in camera_images(obs, model.cameras).items()}
+        frame = {key: image.copy() for key, image in model_inputs.camera_images(obs, model.cameras).items()}
         if model.state:
-            frame[STATE] = model.trained.wrapped(state_vector(obs, model.state, self.state_dim))
+            frame[STATE] = model.trained.wrapped(model_inputs.state_vector(obs, model.state, self.state_dim))
         if model.environment:
-            frame[ENVIRONMENT] = state_vector(obs, model.environment, self.environment_dim)
+            frame[ENVIRONMENT] = model_inputs.state_vector(obs, model.environment, self.environment_dim)
         return model.kind.staging.stage(frame)
 
     def predict(self, rows: Sequence[Row]) -> list[Prediction | Exception]:
@@ -221,7 +206,7 @@ def _of(adapter: str, rows: Sequence[Row]) -> list[int]:
     return [i for i, row in enumerate(rows) if row.adapter == adapter]
 
 
-def _with_defaults(config: LeRobotConfig, kind: Kind) -> LeRobotConfig:
+def _with_defaults(config: LeRobotConfig, kind: kinds.Kind) -> LeRobotConfig:
     """Return the settings, with the checkpoint's values as defaults."""
     coefficient = getattr(kind.config, "temporal_ensemble_coeff", None)
     defaults: dict[str, Any] = {} if config.actions == "ensemble" else {"execute": kind.usual}
@@ -261,8 +246,8 @@ def _of_features(features: Iterable[str], processors: Processors) -> DatasetCont
     `observation.state`.
     """
     keys = {key.removeprefix(f"{STATE}."): key for key in features if key.startswith(f"{STATE}.")}
-    if f"observation.{GRIPPER}" in features:
-        keys[GRIPPER] = f"observation.{GRIPPER}"
+    if f"observation.{model_inputs.GRIPPER}" in features:
+        keys[model_inputs.GRIPPER] = f"observation.{model_inputs.GRIPPER}"
     whole = processors.statistics(STATE)
     parts = {part: processors.statistics(key) for part, key in keys.items()}
     listed = [part for key in features for part, own in keys.items() if own == key]
@@ -271,7 +256,7 @@ def _of_features(features: Iterable[str], processors: Processors) -> DatasetCont
         values, wanted = np.concatenate([parts[part].get(name, []) for part in order]), whole.get(name, [])
         return len(values) == len(wanted) and np.allclose(values, wanted, rtol=1e-5, atol=1e-6)
 
-    for order in (listed, sorted(keys, key=lambda part: (part == GRIPPER, part))):
+    for order in (listed, sorted(keys, key=lambda part: (part == model_inputs.GRIPPER, part))):
         if order and all(map(alike, _MATCHED)):
             break
     else:
@@ -293,16 +278,16 @@ def _cameras(
     names = {key: _short(key) for key in settings.image_features if _EMPTY not in key}
     if unknown := sorted(set(config.masked_cameras) - set(names.values())):
         raise ConfigError(f"masked_cameras: got {unknown}, want some of {sorted(names.values())}")
-    if config.masked_cameras and settings.type not in MASKING:
+    if config.masked_cameras and settings.type not in kinds.MASKING:
         raise ConfigError(
             f"masked_cameras: LeRobot's {settings.type!r} needs all its cameras, {sorted(names.values())}; "
-            f"{sorted(MASKING)} can do without"
+            f"{sorted(kinds.MASKING)} can do without"
         )
     seen = {key: name for key, name in names.items() if name not in config.masked_cameras}
     sources = {renamed: source for source, renamed in renames.items()}
     features = {name: sources.get(key, key) for key, name in seen.items()}  # the dataset's names
     usual = {name: trained.get(feature, _short(feature)) for name, feature in features.items()}
-    chosen = choose_cameras(config.cameras, usual, list(seen.values()))
+    chosen = model_inputs.choose_cameras(config.cameras, usual, list(seen.values()))
     return {key: chosen[name] for key, name in seen.items()}
 
 
@@ -312,7 +297,7 @@ def _short(key: str) -> str:
 
 def _camera(settings: Any, key: str) -> CameraSpec:
     """Specify a camera: any size if the policy resizes, else that of its training."""
-    if settings.type in RESIZING or getattr(settings, "resize_imgs_with_padding", None) is not None:
+    if settings.type in kinds.RESIZING or getattr(settings, "resize_imgs_with_padding", None) is not None:
         return CameraSpec()
     _, height, width = settings.input_features[key].shape
     return CameraSpec(height, width)

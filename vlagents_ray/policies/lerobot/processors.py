@@ -51,8 +51,7 @@ class Processors:
     def __init__(self, folder: Path, settings: Any, config: LeRobotConfig, staging: Staging) -> None:
         self.staging = staging
         saved = [_saved_steps(folder / name) for name in PIPELINES]
-        unknown = sorted(set(config.processors) - set().union(*saved))
-        if unknown:
+        if unknown := sorted(set(config.processors) - set().union(*saved)):
             raise ConfigError(f"processors: got {unknown}, the checkpoint has {[sorted(steps) for steps in saved]}")
         self.steps = [list(steps) for steps in saved]  # the registered names, for both pipelines
         self.step_settings = {  # without steps that depend on the dataset or the machine

@@ -20,18 +20,7 @@ from vlagents_ray.policies.base.accelerator import fetch
 from vlagents_ray.policies.base.model_inputs import camera_images, choose_cameras, needs_gripper, state_vector
 from vlagents_ray.policies.base.staging import StagedRow
 from vlagents_ray.policies.compilation import Compilation
-from vlagents_ray.policies.openvla.prismatic import (
-    OFFERED,
-    Bounds,
-    PreparedRow,
-    Prismatic,
-    PrismaticConfig,
-    PrismaticPolicy,
-    Statistics,
-    load_prismatic,
-    middle,
-    resized,
-)
+from vlagents_ray.policies.openvla import prismatic
 from vlagents_ray.registry import require
 
 _PRIMARY = "full_image"
@@ -40,7 +29,7 @@ _USUAL = {_PRIMARY: "front", "wrist_image": "wrist"}  # of LIBERO
 _STATE = ("xyz_axis_angle", "gripper_qpos")  # of LIBERO, 6 and 2 numbers
 
 
-class OpenVLAOFTConfig(PrismaticConfig):
+class OpenVLAOFTConfig(prismatic.PrismaticConfig):
     """Settings of OpenVLA-OFT; they must state how a checkpoint was trained, since its files do not."""
 
     attention: Literal["sdpa", "eager"] = Field(default="sdpa", description="of the language model; has no causal mask")
@@ -50,7 +39,7 @@ class OpenVLAOFTConfig(PrismaticConfig):
     )
     film: bool = Field(default=False, description="trained with FiLM (OFT+)")
     horizon: int = Field(default=8, ge=1, description="rows of a chunk, as in training: LIBERO 8, ALOHA 25, Bridge 5")
-    bounds: Bounds = Field(
+    bounds: prismatic.Bounds = Field(
         default="q99", description="of actions and states in training: 'q99', or 'min_max' for ALOHA's absolute joints"
     )
     diffusion_steps: int = Field(default=50, ge=1, description="of training")
@@ -63,7 +52,7 @@ class OpenVLAOFTConfig(PrismaticConfig):
         return self
 
 
-class OpenVLAOFT(PrismaticPolicy):
+class OpenVLAOFT(prismatic.PrismaticPolicy):
     """The policy OpenVLA-OFT, which returns a chunk for each `act`."""
 
     Config = OpenVLAOFTConfig
@@ -81,7 +70,7 @@ class OpenVLAOFT(PrismaticPolicy):
     @property
     def contract(self) -> Contract:
         gripper = needs_gripper(self._state) or None
-        behaviour = self.offered(OFFERED if self.config.head == "tokens" else ())
+        behaviour = self.offered(prismatic.OFFERED if self.config.head == "tokens" else ())
         facts = {"action": self._action(), "gripper": gripper, "behaviour": behaviour}
         return self.stated(self._cameras, self._state, self.config.horizon, **facts)
 
@@ -93,7 +82,7 @@ class OpenVLAOFT(PrismaticPolicy):
     def load(self) -> Parallel:
         """Read the checkpoint and its components; raises `ConfigError` if one is missing or unused."""
         config = self.config
-        base = load_prismatic(config, config.bounds)
+        base = prismatic.load_prismatic(config, config.bounds)
         place = {"device": base.device, "dtype": base.dtype}
         parts = {
             "action_head": config.head != "tokens",
@@ -124,16 +113,12 @@ class OpenVLAOFT(PrismaticPolicy):
 
     def perceive(self, obs: Obs) -> tuple[StagedRow, np.ndarray | None]:
         """Return the images, in the order of training, as inputs of the backbones, and the state vector (P,)."""
-        seen = [resized(image) for image in camera_images(obs, self._cameras).values()]
+        seen = [prismatic.resized(image) for image in camera_images(obs, self._cameras).values()]
         if self.config.center_crop:
-            seen = [middle(image) for image in seen]
+            seen = [prismatic.middle(image) for image in seen]
         projector = self.model.proprio
         state = None if projector is None else state_vector(obs, self._state, projector.dim)
         return self.model.base.stage(seen), state
-
-    @property
-    def _checkpoint(self) -> Prismatic | None:
-        return None if self.model is None else self.model.base
 
     def _model_input(self, row: Row, key: str) -> ModelInput:
         seen, state = row.frames[-1]
@@ -145,7 +130,7 @@ class OpenVLAOFT(PrismaticPolicy):
         proprio = None if state is None else base.statistics.scale(key, "proprio").normalise(state)
         return ModelInput(seen, base.tokens(row.instruction), proprio)
 
-    def _compute(self, prepared: Sequence[PreparedRow]) -> list[Prediction]:
+    def _compute(self, prepared: Sequence[prismatic.PreparedRow]) -> list[Prediction]:
         """Run one forward pass, or one per diffusion step. Regression gives a session's samples the same answer."""
         firsts, owners = self.observations_of([entry.row for entry in prepared])
         inputs = [prepared[i].model_input for i in firsts]
@@ -162,7 +147,7 @@ class OpenVLAOFT(PrismaticPolicy):
         return [Prediction(entry.scale.restore(chunk)) for entry, chunk in zip(prepared, chunks, strict=True)]
 
 
-def _action_dim(statistics: Statistics, unnorm_key: str | None, head: Mlp | None) -> int:
+def _action_dim(statistics: prismatic.Statistics, unnorm_key: str | None, head: Mlp | None) -> int:
     """Return the length of an action, which must be the same for the head and all datasets that episodes may select."""
     dims = statistics.action_dims(unnorm_key)
     if head is not None:
@@ -203,7 +188,7 @@ class Parallel:
     `encode_images` and `hidden_states` are functions of tensors, which `compile_with` replaces by their compiled forms.
     """
 
-    base: Prismatic
+    base: prismatic.Prismatic
     horizon: int  # H, the number of rows of a chunk
     dim: int  # D, the length of a row
     head: Mlp | None  # None: action tokens

@@ -22,22 +22,13 @@ from vlagents_ray.policies.base import Prediction, Row
 from vlagents_ray.policies.base.model_inputs import camera_images, choose_cameras
 from vlagents_ray.policies.base.staging import StagedRow
 from vlagents_ray.policies.compilation import Compilation
-from vlagents_ray.policies.openvla.prismatic import (
-    OFFERED,
-    PreparedRow,
-    Prismatic,
-    PrismaticConfig,
-    PrismaticPolicy,
-    load_prismatic,
-    middle,
-    resized,
-)
+from vlagents_ray.policies.openvla import prismatic
 from vlagents_ray.registry import require
 
 _IMAGE = "image"  # the model's only camera
 
 
-class OpenVLAConfig(PrismaticConfig):
+class OpenVLAConfig(prismatic.PrismaticConfig):
     """Settings of OpenVLA."""
 
     center_crop: bool = Field(
@@ -47,7 +38,7 @@ class OpenVLAConfig(PrismaticConfig):
     )
 
 
-class OpenVLA(PrismaticPolicy):
+class OpenVLA(prismatic.PrismaticPolicy):
     """The policy OpenVLA, which returns one action for each `act`."""
 
     Config = OpenVLAConfig
@@ -62,11 +53,11 @@ class OpenVLA(PrismaticPolicy):
 
     @property
     def contract(self) -> Contract:
-        facts = {"action": self._action(), "gripper": None, "behaviour": self.offered(OFFERED)}
+        facts = {"action": self._action(), "gripper": None, "behaviour": self.offered(prismatic.OFFERED)}
         return self.stated(self._cameras, (), 1, **facts)
 
     def load(self) -> TokenDecoder:
-        base = load_prismatic(self.config)
+        base = prismatic.load_prismatic(self.config)
         if self.config.attention != "flash_attention_2":  # which reads the mask as it is
             model = base.network.language_model.model
             model._update_causal_mask = partial(_causal_mask, model._update_causal_mask)
@@ -77,17 +68,13 @@ class OpenVLA(PrismaticPolicy):
     def perceive(self, obs: Obs) -> StagedRow:
         image = camera_images(obs, self._cameras)[_IMAGE]
         if self.config.center_crop:
-            image = middle(resized(image))
+            image = prismatic.middle(prismatic.resized(image))
         return self.model.base.stage([image])
-
-    @property
-    def _checkpoint(self) -> Prismatic | None:
-        return None if self.model is None else self.model.base
 
     def _model_input(self, row: Row, key: str) -> tuple[StagedRow, list[int]]:
         return row.frames[-1], self.model.base.tokens(row.instruction)
 
-    def _compute(self, prepared: Sequence[PreparedRow]) -> list[Prediction]:
+    def _compute(self, prepared: Sequence[prismatic.PreparedRow]) -> list[Prediction]:
         """Decode all answers: sessions greedily unless outputs are requested, samples at temperature 1."""
         firsts, owners = self.observations_of([entry.row for entry in prepared])
         draws = np.full((len(prepared), max(entry.scale.dim for entry in prepared)), np.nan)
@@ -105,7 +92,7 @@ class OpenVLA(PrismaticPolicy):
 class TokenDecoder:
     """A checkpoint and its passes: functions of tensors, which `compile_with` replaces by their compiled forms."""
 
-    base: Prismatic
+    base: prismatic.Prismatic
     longest: int  # the largest number of tokens of an answer
     adapters: Adapters = field(default_factory=Adapters)  # of the policy
 

@@ -71,8 +71,7 @@ class Statistics:
     """The statistics of all datasets on which a checkpoint was trained, by `unnorm_key`, the name of the dataset."""
 
     def __init__(self, datasets: Mapping[str, Any], bounds: Bounds = "q99") -> None:
-        self._datasets = datasets
-        self.bounds = bounds
+        self._datasets, self.bounds = datasets, bounds
 
     @classmethod
     def of(cls, checkpoint: Path, bounds: Bounds = "q99") -> Statistics:
@@ -425,9 +424,10 @@ class PrismaticPolicy(ModelPolicy):
     network = "model.base.network"
 
     @property
-    @abc.abstractmethod
     def _checkpoint(self) -> Prismatic | None:
         """The checkpoint; None before it is loaded."""
+        base: Prismatic | None = None if self.model is None else self.model.base
+        return base
 
     @abc.abstractmethod
     def _model_input(self, row: Row, key: str) -> Any:
@@ -485,8 +485,7 @@ class PrismaticPolicy(ModelPolicy):
         return chunks
 
     def _statistics(self, adapter: str = "") -> Statistics:
-        checkpoint = self._checkpoint
-        if checkpoint is None:
+        if (checkpoint := self._checkpoint) is None:
             raise NotReset(f"{type(self).__name__}: not loaded; call initialize() first")
         return checkpoint.own.get(adapter, checkpoint.statistics)
 
@@ -495,8 +494,7 @@ class PrismaticPolicy(ModelPolicy):
         return None if self._statistics(adapter) is not self._statistics() else self.config.unnorm_key
 
     def _named(self, options: Mapping[str, Any], adapter: str) -> str | None:
-        key = options.get(UNNORM_KEY)
-        if key is None:
+        if (key := options.get(UNNORM_KEY)) is None:
             return None
         if not isinstance(key, str):
             raise InvalidObservation(f"unnorm_key: got {type(key).__name__}, want a dataset's name")

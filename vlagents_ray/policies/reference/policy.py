@@ -13,19 +13,10 @@ from pydantic import Field
 from vlagents_ray.contract import ActionSpec, Contract
 from vlagents_ray.errors import ConfigError
 from vlagents_ray.interface import Obs
-from vlagents_ray.policies.base import ModelConfig, ModelPolicy, Prediction, Row, shared_frames
+from vlagents_ray.policies.base import ModelConfig, ModelPolicy, Prediction, Row, model_inputs, shared_frames
 from vlagents_ray.policies.base.accelerator import fetch, torch_device, torch_dtype
 from vlagents_ray.policies.base.checkpoint import find_checkpoint
 from vlagents_ray.policies.base.config import Guidance, NoiseLevel
-from vlagents_ray.policies.base.model_inputs import (
-    camera_images,
-    camera_specs,
-    choose_cameras,
-    needs_gripper,
-    resize_with_pad,
-    state_specs,
-    state_vector,
-)
 from vlagents_ray.policies.base.staging import StagedRow, Staging
 from vlagents_ray.policies.flow import OFFERED, FlowPasses, start_flow
 from vlagents_ray.policies.reference.checkpoint import (
@@ -90,9 +81,9 @@ class Reference(ModelPolicy):
             return Contract(instruction=True, history=1)
         robot = self.model.robot
         return Contract(
-            cameras=camera_specs(self.model.cameras),
-            state=state_specs(self.state, len(robot.state_mean)),
-            gripper=needs_gripper(self.state),
+            cameras=model_inputs.camera_specs(self.model.cameras),
+            state=model_inputs.state_specs(self.state, len(robot.state_mean)),
+            gripper=model_inputs.needs_gripper(self.state),
             instruction=True,
             action=ActionSpec(**robot.action),
             chunk=self.chunk(self.model.checkpoint.sizes.horizon),
@@ -125,7 +116,7 @@ class Reference(ModelPolicy):
         network = network.eval().requires_grad_(False).to(device, dtype)
         passes = ReferencePasses(network, self.compilation)
         passes.adapters = self.adapters
-        chosen = choose_cameras(self.config.cameras, robot.cameras, CAMERAS)
+        chosen = model_inputs.choose_cameras(self.config.cameras, robot.cameras, CAMERAS)
         cameras = {name: chosen[name] for name in CAMERAS}
         return LoadedReference(network, checkpoint, robot, cameras, dtype, passes, Staging(device))
 
@@ -140,9 +131,9 @@ class Reference(ModelPolicy):
     def perceive(self, obs: Obs) -> StagedRow:
         """Return the network's inputs for one row."""
         model = self.loaded()
-        sizes, found = model.checkpoint.sizes, camera_images(obs, model.cameras)
-        images = np.stack([resize_with_pad(found[name], sizes.side, sizes.side) for name in CAMERAS])
-        state = normalised(model.robot, state_vector(obs, self.state, self.state_dim), sizes.state)
+        sizes, found = model.checkpoint.sizes, model_inputs.camera_images(obs, model.cameras)
+        images = np.stack([model_inputs.resize_with_pad(found[name], sizes.side, sizes.side) for name in CAMERAS])
+        state = normalised(model.robot, model_inputs.state_vector(obs, self.state, self.state_dim), sizes.state)
         staged: StagedRow = model.staging.stage({"tokens": self._begun().prompt, "images": images, "state": state})
         return staged
 

@@ -48,9 +48,7 @@ class Lanes:
     """
 
     def __init__(self, clients: Sequence[UpstreamClient], check: Check, retry_s: float) -> None:
-        self._clients = clients
-        self._check = check
-        self._retry_s = retry_s
+        self._clients, self._check, self._retry_s = clients, check, retry_s
         self._ready: list[UpstreamClient] = []
         self._changed = threading.Condition()
         self._reason: VLAgentsError = NoReplica("upstream: not connected yet")  # why the last attempt failed
@@ -213,10 +211,7 @@ class SessionConnections:
     def __init__(
         self, urls: Sequence[str], make: Callable[[str], UpstreamClient], check: Check, retry_s: float
     ) -> None:
-        self._urls = urls
-        self._make = make
-        self._check = check
-        self._retry_s = retry_s
+        self._urls, self._make, self._check, self._retry_s = urls, make, check, retry_s
         self._clients: dict[str, UpstreamClient] = {}
         self._lock = threading.Lock()
         self._pool = ThreadPoolExecutor(_AT_ONCE, "upstream")

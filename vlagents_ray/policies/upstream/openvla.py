@@ -83,8 +83,7 @@ class OpenVLAClient(UpstreamClient):
             raise ConnectionLost(f"upstream {self.options.url}: it answered with HTTP {response.status}")
         if response.status != http.HTTPStatus.OK:
             raise self.failed(f"HTTP {response.status}: {body[:2000]!r}")
-        action = openvla.decode_action(body, self.options.limits)
-        if action is None:
+        if (action := openvla.decode_action(body, self.options.limits)) is None:
             raise self.failed("error")
         return [action]
 

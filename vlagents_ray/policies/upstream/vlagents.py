@@ -76,8 +76,7 @@ class VlagentsClient(UpstreamClient):
         return value
 
     def _call(self, frame: bytes, deadline: float) -> Any:
-        connection = self._socket
-        if connection is None:
+        if (connection := self._socket) is None:
             raise self.closed()
         try:
             connection.settimeout(_left(deadline))
@@ -101,8 +100,7 @@ class VlagentsClient(UpstreamClient):
         view, at = memoryview(data), 0
         while at < count:
             connection.settimeout(_left(deadline))
-            got = connection.recv_into(view[at:])
-            if not got:
+            if not (got := connection.recv_into(view[at:])):
                 raise ConnectionResetError("the connection ended")
             at += got
         return data

@@ -176,8 +176,7 @@ class RoboArenaClient(OpenPiClient):
     def begin(self) -> None:
         self._session = uuid.uuid4().hex
         self.send(openpi.encode({"endpoint": "reset"}))
-        answer = self.recv()
-        if answer != _RESET:
+        if (answer := self.recv()) != _RESET:
             self._read(answer)  # vLLM-Omni answers with a map; any text other than `_RESET` is an error
 
     def differences(self, metadata: Mapping[str, Any], outgoing: Outgoing) -> list[str]:

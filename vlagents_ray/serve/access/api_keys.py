@@ -127,8 +127,7 @@ class Keys:
             bucket = self._buckets.get(key.name)
             if bucket is None or bucket.rate != key.rate:
                 bucket = self._buckets[key.name] = _Bucket(key.rate)
-            wait_s = bucket.take(time.monotonic())
-            if wait_s > 0:
+            if (wait_s := bucket.take(time.monotonic())) > 0:
                 least_s, most_s = _THROTTLED_S
                 bucket.unread_until = time.monotonic() + min(most_s, max(least_s, wait_s))
         if wait_s > 0:
@@ -179,8 +178,7 @@ class Keys:
     def _read_again(self, now: float) -> None:
         """Read the file if it has changed; runs on a separate thread, which a network drive may block."""
         try:
-            state = self._changed()
-            if state == self._state:
+            if (state := self._changed()) == self._state:
                 return
             self._load(None if state is None else self._read())
         except Exception as error:  # noqa: BLE001 - neither the file's content nor a disk error may fail a request

@@ -47,8 +47,7 @@ def require_same_origin(headers: Mapping[str, str]) -> None:
     Raises:
         Forbidden: The browser reports that another site's page sent the request.
     """
-    site = headers.get("sec-fetch-site", "none")
-    if site not in ("same-origin", "none"):
+    if (site := headers.get("sec-fetch-site", "none")) not in ("same-origin", "none"):
         raise Forbidden(f"sec-fetch-site: got {site[:40]!r}, want 'same-origin'; open the live page itself")
 
 

@@ -95,7 +95,8 @@ class VlagentsConnection:
                 return rpyc.reference_reply(call.sequence, _number(call.args))
             return rpyc.reply(call.sequence, self._value(call))
         except VLAgentsError as error:
-            return rpyc.exception(call.sequence, _builtin(error), f"{error.code}: {error}")
+            kind = next((one.__name__ for one in (TimeoutError, ValueError) if isinstance(error, one)), "RuntimeError")
+            return rpyc.exception(call.sequence, kind, f"{error.code}: {error}")
         except Exception:  # noqa: BLE001 - logged, and answered
             return rpyc.exception(call.sequence, "RuntimeError", internal_error("vlagents"))
 
@@ -173,8 +174,7 @@ class VlagentsConnection:
         """
         data = bytearray()
         while len(data) < length:
-            left_s = min(silent_s, deadline - time.monotonic())
-            if left_s <= 0:
+            if (left_s := min(silent_s, deadline - time.monotonic())) <= 0:
                 raise MessageTooLarge("a message took longer than a client may take")
             self._connection.settimeout(left_s)
             if not (more := self._connection.recv(min(length - len(data), 2**20))):
@@ -221,12 +221,6 @@ def _called(call: RpycCall) -> tuple[str, tuple[Any, ...]]:
     return name, args
 
 
-def _builtin(error: VLAgentsError) -> str:
-    if isinstance(error, TimeoutError):
-        return "TimeoutError"
-    return "ValueError" if isinstance(error, ValueError) else "RuntimeError"
-
-
 def _is_same_machine(connection: socket.socket) -> bool:
     """Return whether the client is on this machine, in which case both ends have the same address."""
     try:
@@ -268,8 +262,7 @@ class SharedMemory:
         data = bytearray(size)
         got = 0
         while got < size:
-            more = os.preadv(descriptor, [memoryview(data)[got:]], got)
-            if more == 0:
+            if (more := os.preadv(descriptor, [memoryview(data)[got:]], got)) == 0:
                 raise InvalidObservation(f"shared memory {name[:40]!r}: became shorter while it was read")
             got += more
         return data

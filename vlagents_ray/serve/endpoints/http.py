@@ -32,18 +32,8 @@ from vlagents_ray.protocol import messages
 from vlagents_ray.protocol.frames import CONTENT_TYPE, decode_requests, encode_replies
 from vlagents_ray.protocol.json_messages import plain_values
 from vlagents_ray.serve.access.api_keys import current_caller
+from vlagents_ray.serve.endpoints import http_messages
 from vlagents_ray.serve.endpoints.docs_page import STYLE, docs_page
-from vlagents_ray.serve.endpoints.http_messages import (
-    RequestDecoder,
-    answer_error,
-    deny,
-    headers_of,
-    html_response,
-    problem_response,
-    public_problem,
-    request_id,
-    session_id,
-)
 from vlagents_ray.serve.engine.engine import Engine
 from vlagents_ray.serve.engine.sender import REFUSED, Sender
 from vlagents_ray.serve.requests import Message as Incoming
@@ -80,7 +70,7 @@ def build_http_app(
             Route("/docs", server.docs),
             *more,
         ],
-        exception_handlers={HTTPException: _http_problem, VLAgentsError: answer_error},
+        exception_handlers={HTTPException: _http_problem, VLAgentsError: http_messages.answer_error},
     )
     app.router.redirect_slashes = False  # many clients drop the body of a redirected POST
     app.router.default = partial(_no_such_path, app.router.default)
@@ -96,7 +86,7 @@ class _HttpEndpoint:
         machine_metadata: Callable[[str], Awaitable[dict[str, Any]]] | None,
     ) -> None:
         self._engine, self._metadata, self._limits = engine, metadata, limits
-        self._requests = RequestDecoder(limits)
+        self._requests = http_messages.RequestDecoder(limits)
         self._machine_metadata = machine_metadata
 
     async def health(self, http: HttpRequest) -> Response:
@@ -110,7 +100,7 @@ class _HttpEndpoint:
         step = self._engine.models.step
         loading = f"the policy is loading{step and f' ({step})'}"
         unready = PolicyUnavailable(f"{loading}, or did not load; GET /v1/metadata says which")
-        return problem_response(unready, request_id(http))
+        return http_messages.problem_response(unready, http_messages.request_id(http))
 
     async def show_metadata(self, http: HttpRequest) -> Response:
         machine = http.headers.get(messages.MACHINE_HEADER)
@@ -119,13 +109,13 @@ class _HttpEndpoint:
         return self._when_ready(http, lambda: JSONResponse(plain_values(self._metadata())))
 
     async def docs(self, http: HttpRequest) -> Response:
-        return self._when_ready(http, lambda: html_response(docs_page(self._metadata()), styles=[STYLE]))
+        return self._when_ready(http, lambda: http_messages.html_response(docs_page(self._metadata()), styles=[STYLE]))
 
     def _when_ready(self, http: HttpRequest, answer: Callable[[], Response]) -> Response:
         try:
             self._engine.require_ready()
         except VLAgentsError as error:
-            return problem_response(error, request_id(http), 503)
+            return http_messages.problem_response(error, http_messages.request_id(http), 503)
         return answer()
 
     def endpoint(self, op: messages.Op) -> Callable[[HttpRequest], Awaitable[Response]]:
@@ -133,9 +123,11 @@ class _HttpEndpoint:
 
         async def handle(http: HttpRequest) -> Response:
             incoming = Incoming(self._engine.stats, "http", op)
-            name, headers = request_id(http), headers_of(http.scope)
+            name, headers = http_messages.request_id(http), http_messages.headers_of(http.scope)
             try:
-                sender = Sender(self._engine, "http", session_id(http), caller=current_caller(), connected=False)
+                sender = Sender(
+                    self._engine, "http", http_messages.session_id(http), caller=current_caller(), connected=False
+                )
                 admission = sender.admission(self._limits, rank=headers.get(messages.RANK_HEADER, "robot"))
                 decoded = await self._requests.read(op, _timed(http, incoming), admission, name)
                 incoming.decoded(decoded)
@@ -152,9 +144,9 @@ class _HttpEndpoint:
                 incoming.record_failure("disconnected")
                 return Response(status_code=499)
             except Exception as error:  # noqa: BLE001 - the error is the reply to the client
-                problem = public_problem(error, op, name)
+                problem = http_messages.public_problem(error, op, name)
                 incoming.record_failure(problem.code)
-                return problem_response(problem, name)
+                return http_messages.problem_response(problem, name)
 
         return handle
 
@@ -199,7 +191,7 @@ class _HttpEndpoint:
             await sender.ask(incoming, decoded, admission)
         except Exception as error:  # noqa: BLE001 - the error is the reply to the client
             name = "" if isinstance(error, VLAgentsError) else uuid.uuid4().hex
-            incoming.refuse(public_problem(error, "stream", name), name)
+            incoming.refuse(http_messages.public_problem(error, "stream", name), name)
         return incoming.frame()
 
 
@@ -217,7 +209,9 @@ def _timed(http: HttpRequest, incoming: Incoming) -> HttpRequest:
 async def _no_such_path(of_http: ASGIApp, scope: Scope, receive: Receive, send: Send) -> None:
     """Refuse an unknown path: Starlette would refuse a WebSocket with 403, which means an invalid key."""
     if scope["type"] == "websocket":
-        await deny(WebSocket(scope, receive, send), UnknownApp("no such path; GET /docs lists what there is"))
+        await http_messages.deny(
+            WebSocket(scope, receive, send), UnknownApp("no such path; GET /docs lists what there is")
+        )
     else:
         await of_http(scope, receive, send)
 
@@ -226,8 +220,10 @@ async def _http_problem(http: HttpRequest, error: Exception) -> Response:
     """Reply to a request that the router refuses: an unknown path, or an unsupported method."""
     refused = cast(HTTPException, error)
     if refused.status_code == 404:
-        return problem_response(UnknownApp("no such path; GET /docs lists what there is"), request_id(http))
+        return http_messages.problem_response(
+            UnknownApp("no such path; GET /docs lists what there is"), http_messages.request_id(http)
+        )
     cause = MalformedMessage(f"{refused.detail}; GET /docs lists what there is")
-    response = problem_response(cause, request_id(http), refused.status_code)
+    response = http_messages.problem_response(cause, http_messages.request_id(http), refused.status_code)
     response.headers.update(refused.headers or {})
     return response

@@ -107,8 +107,7 @@ class Pool:
             for lost in [key for key, channel in self._leased.items() if channel.leased < oldest]:
                 self._return_channel(self._leased.pop(lost))
             fitting = [channel for channel in self._free if channel.capacity >= length]
-            channel = min(fitting, key=lambda one: one.capacity, default=None)
-            if channel is not None:
+            if (channel := min(fitting, key=lambda one: one.capacity, default=None)) is not None:
                 self._free.remove(channel)
         if channel is None:
             channel = self._create(max(_LEAST, 1 << (length - 1).bit_length()))

@@ -143,8 +143,7 @@ class UnixConnection(PolledConnection):
             if not data:
                 self.disconnect()
                 return
-            sender = self._sender or self._authenticate(bytes(data[:_KEY_BYTES]))
-            if sender is not None:
+            if (sender := self._sender or self._authenticate(bytes(data[:_KEY_BYTES]))) is not None:
                 self._receive(sender, message, time_in_socket_s(control), data, descriptors)
         except VLAgentsError as error:
             message.refuse(error)

@@ -28,15 +28,8 @@ from vlagents_ray.ray_tools import head_monitor, private, session
 from vlagents_ray.ray_tools.reaper import MARK
 from vlagents_ray.serve.access.api_keys import require_access, warn_of_plain_http
 from vlagents_ray.serve.config.deployment import AccessArgs, ServerArgs
+from vlagents_ray.serve.launch import haproxy
 from vlagents_ray.serve.launch.deployment_file import Deployment, our_apps, with_gateways_at, with_replicas_on
-from vlagents_ray.serve.launch.haproxy import (
-    NO_INGRESS,
-    PublicListener,
-    Tls,
-    haproxy_binary,
-    ingress_environment,
-    wait_for_haproxy,
-)
 from vlagents_ray.serve.ports import EVERYWHERE, HOST, LOOPBACK, free_port, is_free, keep
 
 log = logging.getLogger(__name__)
@@ -109,7 +102,7 @@ def running_server(
     keys_file: Path | None = None,
     insecure: bool = False,
     plain_http: bool = False,
-    tls: Tls | None = None,
+    tls: haproxy.Tls | None = None,
     ingress: bool = True,
 ) -> Iterator[Server]:
     """Serve `config` for the length of the context, and stop on exit everything that was started here.
@@ -174,7 +167,7 @@ def running_server(
         wait_for_proxies(proxies, lambda: private.proxies_now(client))
         wait_until_ready(serve, urls, ours, deadline, functools.partial(_missing_gpus, config))
         if ingress and address is None and (stats_port := os.environ.get("RAY_SERVE_HAPROXY_STATS_PORT")):
-            wait_for_haproxy(serve, paths, int(stats_port), deadline)
+            haproxy.wait_for_haproxy(serve, paths, int(stats_port), deadline)
         if own and ingress:
             session.announce(url, paths, ray.get_runtime_context().gcs_address)
         yield Server(url, {name: url + path for name, path in paths.items()})
@@ -249,7 +242,7 @@ def _gpus(args: ServerArgs) -> float:
     return replicas * args.resources.num_gpus
 
 
-def _check_access(config: Deployment, host: str, insecure: bool, tls: Tls | None) -> None:
+def _check_access(config: Deployment, host: str, insecure: bool, tls: haproxy.Tls | None) -> None:
     """Check the access to each application, and warn if keys would cross the network unencrypted.
 
     Raises:
@@ -266,7 +259,7 @@ def _check_access(config: Deployment, host: str, insecure: bool, tls: Tls | None
 
 @contextlib.contextmanager
 def _ray(
-    address: str | None, host: str, port: int, tls: Tls | None, num_cpus: int | None, ingress: bool
+    address: str | None, host: str, port: int, tls: haproxy.Tls | None, num_cpus: int | None, ingress: bool
 ) -> Iterator[dict[str, Any]]:
     """Connect to a Ray or start one; yield Serve's options for its host, port and certificate."""
     if not ray.is_initialized() and address is None:
@@ -303,8 +296,8 @@ def spread_over_gpus(parts: Mapping[str, Deployment], *, kept: float = 0.0) -> d
 
 @contextlib.contextmanager
 def own_ray(
-    host: str, port: int, *, tls: Tls | None = None, num_cpus: int | None = None, ingress: bool = True
-) -> Iterator[PublicListener | None]:
+    host: str, port: int, *, tls: haproxy.Tls | None = None, num_cpus: int | None = None, ingress: bool = True
+) -> Iterator[haproxy.PublicListener | None]:
     """Run a private Ray for the length of the context, which no other machine and no other user can reach.
 
     The arguments are those of `running_server`; the server will listen at `host` and `port`.
@@ -332,13 +325,13 @@ def own_ray(
         ours = {MARK: str(folder), session.ALONE: "0", HOST: host if tls is None else LOOPBACK}
         listener = None
         if not ingress:
-            ours |= NO_INGRESS
-        elif (binary := haproxy_binary()) is not None:
+            ours |= haproxy.NO_INGRESS
+        elif (binary := haproxy.haproxy_binary()) is not None:
             if tls is not None or host not in (LOOPBACK, "localhost"):
                 bundle = None if tls is None else tls.bundle(folder)
                 client_ca = None if tls is None or tls.client_ca is None else tls.client_ca.absolute()
-                listener = PublicListener(host, port, free_port(), bundle, client_ca)
-            settings = ingress_environment(folder, binary, listener)
+                listener = haproxy.PublicListener(host, port, free_port(), bundle, client_ca)
+            settings = haproxy.ingress_environment(folder, binary, listener)
             # HAProxy's files and admin socket are in the folder, regardless of the user's settings for clusters.
             ours |= {key: value for key, value in settings.items() if value.startswith(str(folder))}
             environment |= settings

@@ -66,18 +66,12 @@ class Worker:
     def _run(self) -> None:
         with suppress(OSError):
             os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), _NICE)
-        while self._made(self._calls.get()):
-            pass
-
-    def _made(self, call: Callable[[], None] | None) -> bool:
-        """Make a call, and drop all references to it; return False at the end."""
-        if call is None:
-            return False
-        try:
-            call()
-        except Exception:
-            logger.exception("%s: a request is left out", self._thread.name)
-        return True
+        while (call := self._calls.get()) is not None:
+            try:
+                call()
+            except Exception:
+                logger.exception("%s: a request is left out", self._thread.name)
+            del call  # the memory of a request counts as held until it is freed
 
 
 @dataclass(slots=True, eq=False)

@@ -8,7 +8,7 @@ from collections.abc import Mapping
 from typing import Any, NamedTuple
 
 from vlagents_ray import tracing
-from vlagents_ray.protocol.messages import Reply, Request
+from vlagents_ray.protocol.messages import Reply
 from vlagents_ray.registry import require
 from vlagents_ray.serve.engine.observer import Observer
 from vlagents_ray.serve.periodic import each_half_second
@@ -54,7 +54,9 @@ class RequestSpans(Observer):
     def on_request(self, pending: PendingRequest) -> None:
         """Store the start of the request."""
         if pending.request.op in _OPS:
-            pending.kept[self] = _traceparent(pending.request), time.time_ns()
+            obs = pending.request.obs
+            stated = "" if obs is None else obs.info.get(tracing.TRACEPARENT, "")  # untrusted
+            pending.kept[self] = stated[:_TEXT] if isinstance(stated, str) else "", time.time_ns()
 
     def on_answer(self, pending: PendingRequest, reply: Reply) -> None:
         """Export the span of the answered request."""
@@ -94,12 +96,6 @@ class RequestSpans(Observer):
 
     def _stage(self, name: str, inside: Any, begun_ns: int, ended_ns: int) -> None:
         self._tracer.start_span(name, inside, start_time=begun_ns).end(ended_ns)
-
-
-def _traceparent(request: Request) -> str:
-    """Return the trace id in a request, which is untrusted; "" if there is none."""
-    stated = "" if request.obs is None else request.obs.info.get(tracing.TRACEPARENT, "")
-    return stated[:_TEXT] if isinstance(stated, str) else ""
 
 
 def _ns(milliseconds: float) -> int:

@@ -149,8 +149,7 @@ def _trained(agent: Agent, updates: WeightUpdates) -> dict[str, Any]:
         values = {name: [dtype_name(value), list(value.shape)] for name, value in agent.parameters().items()}
     except NotTrainable as error:
         return {"refusal": str(error)}
-    newest = updates.newest()
-    return {"values": values, "fingerprint": updates.given(0).fingerprint, "gpus": newest.gpus}
+    return {"values": values, "fingerprint": updates.given(0).fingerprint, "gpus": updates.newest().gpus}
 
 
 def _read_calls(

@@ -99,8 +99,7 @@ def probe(
     if _minor(said["python"]) < OLDEST:
         oldest = ".".join(map(str, OLDEST))
         raise ConfigError(f"environment.python: {python} is Python {said['python']}, want {oldest} or newer")
-    theirs = said.get("vlagents-ray")
-    if theirs != version:
+    if (theirs := said.get("vlagents-ray")) != version:
         raise ConfigError(
             f"environment.python: {python} has {f'vlagents-ray {theirs}' if theirs else 'no vlagents-ray'}, want "
             f"{version} as here; install it there, or make the environment with `{_making(python)}`"

@@ -149,8 +149,7 @@ class Exporter:
 
 def _series(tags: Mapping[str, str], kind: Any, name: str, text: str, *own: str, **options: Any) -> Any:
     """Create a series of `kind`, with `tags` and its `own` tags, which each value sets."""
-    metric = kind(f"vlagents_{name}", description=text, tag_keys=(*tags, *own), **options)
-    return metric.set_default_tags(tags)
+    return kind(f"vlagents_{name}", description=text, tag_keys=(*tags, *own), **options).set_default_tags(tags)
 
 
 def _in_slices(values: Iterable[T]) -> Iterator[T]:

@@ -293,7 +293,7 @@ class PolicyReplica(ClientApi, SiblingApi):
 
     def read_header(self, header: bytes, options: PushOptions) -> dict[str, ValueSpec]:
         """Check the header of new weights, before they are received."""
-        return self._engine.weights.read_header(header, options)
+        return self._engine.weights.own().read_header(header, options)
 
     async def versions_of_weights(self) -> list[int]:
         """Return the newest version of each replica that can be reached; called by a learner."""

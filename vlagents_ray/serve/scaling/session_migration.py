@@ -353,8 +353,7 @@ class SessionMigrator:
 
     async def _move(self, session_id: str, peer: Peer) -> bool:
         """Move the session from that replica to this one; return False if its state there has changed."""
-        state = await self._answer(peer.ask(HeldSessions.copy, session_id), EXPORT_S)
-        if state is None:
+        if (state := await self._answer(peer.ask(HeldSessions.copy, session_id), EXPORT_S)) is None:
             return False
         arriving = await self._in_thread(self._engine.prepare_adoption, session_id, state, _LOAD_S)
         version = state["steps"], state["moves"]
