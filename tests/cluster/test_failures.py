@@ -28,7 +28,7 @@ from vlagents_ray.serve.ports import EVERYWHERE
 
 pytestmark = [pytest.mark.hosts, pytest.mark.slow]
 
-until = functools.partial(wait_for, every_s=0.25)  # what takes a process, or all results, to find out
+until = functools.partial(wait_for, timeout_s=300, every_s=0.25)  # what takes a process, or all results, to find out
 POLICY = "policy"  # a resource of nodes that replicas may run on
 # Joined to the cluster before the command asks its policy, which is inside.
 _SERVED = "import ray; ray.init(log_to_driver=False); from vlagents_ray.cli.main import app; app()"
@@ -52,6 +52,8 @@ def cluster_of(
 ) -> Iterator[RayCluster]:
     """A head that plays nothing, and nodes with so many workers, and perhaps a replica; `run` is to be played there."""
     shared = {"PYTHONPATH": PYTHONPATH, "TERM": "dumb", HURRY: str(run.hurry)} | environment
+    # A node that is silent for 36 s is dead, not for a minute as by Ray's default; a partition of 20 s is endured.
+    shared["RAY_health_check_failure_threshold"] = "3"
     with ray_cluster([head], cpus=0, environment=shared) as cluster:
         for host, workers, serves in nodes:
             cluster.join(host, workers, resources=json.dumps({POLICY: 1} if serves else {}))
