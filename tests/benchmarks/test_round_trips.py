@@ -50,6 +50,7 @@ def test_all_take_turns_in_short_rounds_and_nobody_is_always_the_first() -> None
 @pytest.mark.slow
 @pytest.mark.integration
 @pytest.mark.server
+@pytest.mark.alone
 def test_what_an_act_uses_is_counted_by_client_and_server() -> None:
     ways, _ = own_clients(["shm", "http"])
     found = measure(ways, 300, lambda _: None).to_json()["use"]
