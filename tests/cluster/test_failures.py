@@ -52,8 +52,6 @@ def cluster_of(
 ) -> Iterator[RayCluster]:
     """A head that plays nothing, and nodes with so many workers, and perhaps a replica; `run` is to be played there."""
     shared = {"PYTHONPATH": PYTHONPATH, "TERM": "dumb", HURRY: str(run.hurry)} | environment
-    # A node that is silent for 36 s is dead, not for a minute as by Ray's default; a partition of 20 s is endured.
-    shared["RAY_health_check_failure_threshold"] = "3"
     with ray_cluster([head], cpus=0, environment=shared) as cluster:
         for host, workers, serves in nodes:
             cluster.join(host, workers, resources=json.dumps({POLICY: 1} if serves else {}))

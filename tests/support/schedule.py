@@ -73,5 +73,6 @@ def pytest_terminal_summary(terminalreporter: Any, config: pytest.Config) -> Non
             took[report.nodeid.partition("::")[0]] += report.duration
     file = Path(name)
     known = json.loads(file.read_text()) if file.exists() else {}
-    known[config.option.markexpr] = {test: round(s, 1) for test, s in took.items() if s >= _LEAST_S}
+    others = {test: s for test, s in known.get(config.option.markexpr, {}).items() if test not in took}
+    known[config.option.markexpr] = others | {test: round(s, 1) for test, s in took.items() if s >= _LEAST_S}
     file.write_text(json.dumps(known, indent=1, sort_keys=True) + "\n")
