@@ -49,12 +49,12 @@ def test_a_robot_skips_the_ticks_that_pass_during_an_act(monkeypatch: pytest.Mon
 @pytest.mark.server
 @pytest.mark.alone
 def test_the_fleet_and_both_curves(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    plan = GrowthPlan(robots=2, hz=50, sessions=[1, 6], replicas=[1, 2], acts_per_s=100, seconds=1)
+    plan = GrowthPlan(robots=10, hz=10, sessions=[1, 6], replicas=[1, 2], acts_per_s=100, seconds=1)
     found = json.loads(json.dumps(measure_growth(plan)))
     assert 0 < found["fleet"]["acts"] <= 100  # 100 ticks, some of which pass if the machine is busy
     assert [one["sessions"] for one in found["sessions"]] == [1, 6]
     assert [one["replicas"] for one in found["replicas"]] == [1, 2]
-    assert [sum(one["sessions_by_replica"]) for one in found["replicas"]] == [2, 2]
+    assert [sum(one["sessions_by_replica"]) for one in found["replicas"]] == [10, 10]
     for one in (found["fleet"], *found["sessions"], *found["replicas"]):
         assert 0 <= one["on_time"] <= 1
         assert one["client"]["cpu_ms"] > 0
