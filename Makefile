@@ -23,7 +23,7 @@ SHELL := /bin/bash
 .SHELLFLAGS := -eu -o pipefail -c
 .DELETE_ON_ERROR:
 .DEFAULT_GOAL := setup
-.PHONY: setup demo reference bench gpu gpu-pack check quick test integrations families docs verified extras locks dist sbom fmt lint type clean
+.PHONY: setup demo reference bench gpu gpu-pack check quick test integrations environments families docs verified extras locks dist sbom fmt lint type clean
 
 VENV ?= .venv
 TORCH ?= torch==2.13.0
@@ -109,9 +109,12 @@ integrations: setup
 PLAY = VLAGENTS_RAY_ENVIRONMENTS=$(abspath $(VENV)) $(BIN)/python tests/support/play_again.py \
   -n $(TEST_PROCESSES) --dist loadfile --no-loadscope-reorder -m "$(1)"
 
-# Environments one after the other, as each installs this folder; then the tests of two at once.
-families:
+# One after the other, as each installs this folder.
+environments:
 	@$(MAKE) --no-print-directory $(FAMILIES:%=$(VENV)-%/.installed)
+
+# The tests of two at once.
+families: environments
 	@$(MAKE) --no-print-directory --jobs=2 --output-sync $(FAMILIES:%=family-%)
 
 family-%: $(VENV)-%/.installed

@@ -90,8 +90,9 @@ def measure_scaling(
     found: dict[str, Any] = {"plan": asdict(plan), "cores": os.cpu_count(), "clusters": []}
     clusters = (0,) if address else plan.nodes  # 0: all nodes
     for nodes in clusters:
-        with driving(plan, nodes, address) as (driver, size, made):
-            found["clusters"].append(measure_cluster(plan, size, driver, progress, made, shared=nodes == clusters[0]))
+        shared = nodes == clusters[0]
+        with driving(plan, nodes, address, shared=shared) as (driver, size, made):
+            found["clusters"].append(measure_cluster(plan, size, driver, progress, made, shared=shared))
             if nodes == clusters[-1]:
                 progress("the driver's costs")
                 found["driver"] = _driver_costs(plan, driver)
@@ -100,17 +101,18 @@ def measure_scaling(
 
 @contextlib.contextmanager
 def driving(
-    plan: ScalingPlan, nodes: int, address: str | None = None
+    plan: ScalingPlan, nodes: int, address: str | None = None, *, shared: bool = False
 ) -> Iterator[tuple[LineProcess, int, Sequence[Host]]]:
-    """Start a driver and its policies on `nodes` hosts or at `address`; yields it, the nodes' number, and the hosts."""
+    """Start a driver and its policies on `nodes` hosts or at `address`; yields it, the nodes' number, and the hosts.
+
+    `shared` adds the policies of workers that share a replica.
+    """
     size = max(1, nodes)
     slots = math.ceil(plan.most / size)
     pinned = address is None
-    fleets = {
-        OWN: Fleet(slots * size, pinned=pinned),
-        SHARED: Fleet(size, pinned=pinned),
-        CHUNKS: Fleet(size, CHUNK, pinned),
-    }
+    fleets = {OWN: Fleet(slots * size, pinned=pinned)}
+    if shared:
+        fleets |= {SHARED: Fleet(size, pinned=pinned), CHUNKS: Fleet(size, CHUNK, pinned)}
     with contextlib.ExitStack() as stack:
         start: Callable[[list[str]], list[str]] = list
         made: Sequence[Host] = ()

@@ -23,10 +23,17 @@ from needs import (
     skip_what_is_missing,
 )
 from process_resources import own_ray_folder, pytest_pyfunc_call, turn
+from schedule import pytest_terminal_summary, pytest_xdist_make_scheduler, seconds, unit
 
 from vlagents_ray.envs.graphics import prepare_rendering
 
-__all__ = ["pytest_make_collect_report", "pytest_pyfunc_call", "pytest_runtest_makereport"]
+__all__ = [
+    "pytest_make_collect_report",
+    "pytest_pyfunc_call",
+    "pytest_runtest_makereport",
+    "pytest_terminal_summary",
+    "pytest_xdist_make_scheduler",
+]
 
 # No test talks to the world; set before anything that reads them is imported.
 os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
@@ -46,6 +53,7 @@ _RAY_FOLDER = own_ray_folder()
 # What takes longest goes first, so that the processes that share the tests end at about the same time; files that share
 # a Ray follow those that start their own, so that each process starts the shared one once.
 _ORDER = ("hosts", "server", "ray", shared.FIXTURE, "vulkan", "sim", "torch")
+_SHARED = _ORDER.index(shared.FIXTURE)
 _shared_files: set[Path] = set()
 
 
@@ -62,20 +70,25 @@ def pytest_itemcollected(item: pytest.Item) -> None:
     mark_tier(item)
 
 
-def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Put the files in order: a file's tests stay together, and share what it starts."""
-    files: dict[object, int] = {}
+def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
+    """Put the tests in order: those of a file stay together, unless they run alone, and share what it starts."""
+    places: dict[str, int] = {}
     for item in items:
         if " at 0x" in item.nodeid:  # processes that share the tests must collect the same
             raise pytest.UsageError(f"{item.nodeid}: got an address in a test's name; name its parameters with ids=")
         marked = {marker.name for marker in item.iter_markers()}
         place = next((number for number, name in enumerate(_ORDER) if name in marked), len(_ORDER))
         if item.path in _shared_files:
-            place = _ORDER.index(shared.FIXTURE)
-        if "alone" in marked:  # when there is nothing left to wait for
-            place = len(_ORDER) + 1
-        files[item.path] = min(files.get(item.path, place), place)
-    items.sort(key=lambda item: files[item.path])
+            place = _SHARED
+        places[unit(item.nodeid)] = min(places.get(unit(item.nodeid), place), place)
+    took = seconds(config)
+
+    def order(item: pytest.Item) -> tuple[bool, int, float, int]:
+        place, alone = places[unit(item.nodeid)], item.get_closest_marker("alone") is not None
+        # Alone when there is nothing left to wait for.
+        return alone, (place > _SHARED) - (place < _SHARED), -took[unit(item.nodeid)], place
+
+    items.sort(key=order)
 
 
 def pytest_collection_finish() -> None:

@@ -13,6 +13,7 @@ from pathlib import Path
 
 import pytest
 from needs import left_out
+from schedule import in_order
 
 
 @pytest.mark.parametrize(
@@ -46,6 +47,20 @@ def test_the_page_of_the_tests_lists_every_module_of_support() -> None:
     modules = {path.stem for path in (tests / "support").glob("*.py")} | packages
     page = (tests / "README.md").read_text()
     assert {name for name in modules if f"`{name}`" not in page and f"support/{name}.py" not in page} == set()
+
+
+def test_what_runs_alone_is_apart_from_its_file_and_clusters_are_played_by_one_process() -> None:
+    beside = [
+        "tests/cluster/test_a.py::x",
+        "tests/cluster/test_b.py::x[a::b]",
+        "tests/test_c.py::x",
+        "tests/test_d.py::x",
+    ]
+    alone = ["tests/cluster/test_a.py::y", "tests/test_d.py::y", "tests/test_d.py::z"]
+    together: dict[str, list[str]] = {}
+    for test, unit in in_order([*beside, *alone]).items():
+        together.setdefault(unit, []).append(test)
+    assert list(together.values()) == [beside[:2], beside[2:3], beside[3:], alone[:1], alone[1:]]
 
 
 SUPPORT = Path(__file__).parent / "support"

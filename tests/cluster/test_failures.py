@@ -28,7 +28,7 @@ from vlagents_ray.serve.ports import EVERYWHERE
 
 pytestmark = [pytest.mark.hosts, pytest.mark.slow]
 
-until = functools.partial(wait_for, every_s=0.25)  # what takes a process, or all results, to find out
+until = functools.partial(wait_for, timeout_s=300, every_s=0.25)  # what takes a process, or all results, to find out
 POLICY = "policy"  # a resource of nodes that replicas may run on
 # Joined to the cluster before the command asks its policy, which is inside.
 _SERVED = "import ray; ray.init(log_to_driver=False); from vlagents_ray.cli.main import app; app()"

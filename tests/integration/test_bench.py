@@ -74,7 +74,6 @@ def test_throughput_comes_near_the_bare_policy_and_never_above_it(ray_home: Path
 
 @pytest.mark.slow
 @pytest.mark.integration
-@pytest.mark.alone
 def test_peers_make_load_in_the_same_run(ray_home: Path, tmp_path: Path) -> None:
     file = tmp_path / "throughput.json"
     few = ["--clients", "1,2", "--batch", "2", "--seconds", "0.5", "--rounds", "2", "--robot-seconds", "1"]

@@ -14,10 +14,11 @@ import ray
 import served_agents
 from eval_fakes import wait_for
 from prometheus_series import scrape
+from shared_ray import shared_server
 
-from tests.integration.conftest import serving
 from vlagents_ray import DeadlineExceeded, Obs, PolicyUnavailable, RemoteAgent
 from vlagents_ray.client.transports.select import TransportName
+from vlagents_ray.serve.launch.deployment_file import Deployment, deployment
 from vlagents_ray.serve.launch.server import Server
 
 CALL_S, ACT_S = 5, 6  # a replica that stands still for 3 s is not a hung one
@@ -27,7 +28,11 @@ OUTSIDE: list[TransportName] = ["shm", "websocket", "http"]
 
 @pytest.fixture(scope="module")
 def server(shared_ray: None) -> Iterator[Server]:
-    with serving("served_agents:Hanging", replicas=2, limits={"act_s": ACT_S, "warm_up_s": ACT_S}) as server:
+    limits = {"act_s": ACT_S, "warm_up_s": ACT_S}
+    config = deployment("served_agents:Hanging", replicas=2, limits=limits).model_dump(exclude_unset=True)
+    # A hung replica never drains: Serve waits for that in vain, 20 s by our default.
+    config["applications"][0]["deployments"] = [{"name": "Policy", "graceful_shutdown_timeout_s": 2}]
+    with shared_server(Deployment(**config)) as server:
         yield server
 
 

@@ -6,8 +6,7 @@ import contextlib
 import json
 import os
 import signal
-import subprocess
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any, get_args
 
@@ -221,76 +220,25 @@ SMALL = {
 }
 
 
-@pytest.fixture(scope="module")
-def folder() -> Iterator[Path]:
-    """A folder with the plan, and of the Ray of each run."""
+@pytest.mark.server
+@pytest.mark.slow
+def test_a_killed_run_goes_on_to_the_table_of_a_whole_one(tmp_path: Path) -> None:
+    whole, killed = tmp_path / "whole", tmp_path / "killed"
     with ray_folder() as folder:
         (folder / "plan.yaml").write_text(json.dumps(SMALL))
-        yield folder
-
-
-@pytest.fixture(scope="module")
-def undisturbed(folder: Path, tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
-    """The table of a run in which nothing was killed."""
-    out = tmp_path_factory.mktemp("runs") / "whole"
-    with start_run(folder, out) as run:
-        printed = ended(run, folder)
+        with start_run(folder, whole) as run:
+            printed = ended(run, folder)
+        with start_run(folder, killed) as run:
+            wait_for(lambda: (killed / "checkpoints" / "rpd.pt").exists() or run.poll() is not None, timeout_s=400)
+            run.kill()  # after its first iteration
+        end(folder)
+        with start_run(folder, killed, "--resume") as run:
+            assert "demonstrations:" not in ended(run, folder)
     assert "demonstrations: 8 of 8 episodes solved" in printed
-    assert (out / "report.html").is_file()
-    found = table(out)
+    assert (whole / "report.html").is_file()
+    found = table(whole)
     assert list(found) == ["bc@300", "rpd@400"]
-    return found
-
-
-@pytest.mark.server
-@pytest.mark.slow
-def test_a_killed_run_goes_on_to_the_same_table(folder: Path, undisturbed: dict[str, Any], tmp_path: Path) -> None:
-    out = tmp_path / "run"
-    with start_run(folder, out) as run:
-        wait_until_rpd_learns(run, out)
-        run.kill()
-    end(folder)
-    with start_run(folder, out, "--resume") as run:
-        assert "demonstrations:" not in ended(run, folder)
-    assert table(out) == undisturbed
-
-
-@pytest.mark.server
-@pytest.mark.slow
-@pytest.mark.integration
-def test_killed_replicas_and_workers_change_nothing(folder: Path, undisturbed: dict[str, Any], tmp_path: Path) -> None:
-    out, pushed, killed = tmp_path / "run", tmp_path / "pushed", tmp_path / "killed"
-    with start_run(folder, out, before=HELD.format(pushed=str(pushed), killed=str(killed))) as run:
-        wait_for(lambda: pushed.exists() or run.poll() is not None, timeout_s=400)
-        for pid in [*processes(folder, "ray::ServeReplica:rpd"), *processes(folder, "ray::Rollout")]:
-            with contextlib.suppress(ProcessLookupError):
-                os.kill(pid, signal.SIGKILL)
-        killed.touch()
-        assert "once more, as the policy was restarted" in ended(run, folder)
-    assert table(out) == undisturbed
-
-
-# A run that waits when the replica of `rpd` holds the weights of its second iteration, before episodes are played.
-HELD = """
-import pathlib, time
-from train import LearnRun
-
-collect, pushed, killed = LearnRun._collect, pathlib.Path({pushed!r}), pathlib.Path({killed!r})
-
-def held(self, rollouts, version):
-    if version == 350:
-        pushed.touch()
-        while not killed.exists():
-            time.sleep(0.1)
-    return collect(self, rollouts, version)
-
-LearnRun._collect = held
-"""
-
-
-def wait_until_rpd_learns(run: subprocess.Popen[str], out: Path) -> None:
-    """Until the first of its iterations is over."""
-    wait_for(lambda: (out / "checkpoints" / "rpd.pt").exists() or run.poll() is not None, timeout_s=400)
+    assert table(killed) == found
 
 
 STEPS = 6  # of an episode
@@ -414,26 +362,50 @@ def test_the_tokens_of_the_better_episodes_of_a_group_become_likelier() -> None:
     assert min(gained[0], gained[3]) > 0 > max(gained[1], gained[2])
 
 
+# A run that waits when the replica holds the weights of its second iteration, before episodes are played.
+HELD = """
+import pathlib, time
+from train import LearnRun
+
+collect, pushed, killed = LearnRun._collect, pathlib.Path({pushed!r}), pathlib.Path({killed!r})
+
+def held(self, rollouts, version):
+    if version == 420:
+        pushed.touch()
+        while not killed.exists():
+            time.sleep(0.1)
+    return collect(self, rollouts, version)
+
+LearnRun._collect = held
+"""
+
+
 @pytest.mark.server
 @pytest.mark.slow
 @pytest.mark.integration
-def test_the_example_killed_after_an_iteration_goes_on_to_the_table_of_a_whole_run(tmp_path: Path) -> None:
+def test_runs_of_the_example_end_with_one_table_whatever_is_killed(tmp_path: Path) -> None:
+    """Of one, the replica and the workers in the second iteration; the other one itself after the first."""
     example = yaml.safe_load((Path(__file__).parents[2] / "examples/learn/grpo.yaml").read_text())
     small = {"iterations": 2, "episodes": 32, "evaluate_every": 1, "held_out": 8}  # with the example's clone
-    whole, killed = tmp_path / "whole", tmp_path / "killed"
+    whole, resumed, pushed, killed = (tmp_path / name for name in ("whole", "resumed", "pushed", "killed"))
     with ray_folder() as folder:
         (folder / "plan.yaml").write_text(json.dumps(example | small))
-        with start_run(folder, whole) as run:
-            ended(run, folder)
-        with start_run(folder, killed) as run:
-            first = killed / "checkpoints" / "grpo.pt"
+        with start_run(folder, whole, before=HELD.format(pushed=str(pushed), killed=str(killed))) as run:
+            wait_for(lambda: pushed.exists() or run.poll() is not None, timeout_s=400)
+            for pid in [*processes(folder, "ray::ServeReplica:grpo"), *processes(folder, "ray::Rollout")]:
+                with contextlib.suppress(ProcessLookupError):
+                    os.kill(pid, signal.SIGKILL)
+            killed.touch()
+            assert "once more, as the policy was restarted" in ended(run, folder)
+        with start_run(folder, resumed) as run:
+            first = resumed / "checkpoints" / "grpo.pt"
             wait_for(lambda: first.exists() or run.poll() is not None, timeout_s=400)
             run.kill()
         end(folder)
-        with start_run(folder, killed, "--resume") as run:
+        with start_run(folder, resumed, "--resume") as run:
             assert "demonstrations:" not in ended(run, folder)
     # Each iteration took its steps, pushed them, and was evaluated with other weights than the one before.
     found = table(whole)
     assert list(found) == ["grpo@400", "grpo@420", "grpo@440"]
     assert len({weights for weights, _ in found.values()}) == 3
-    assert table(killed) == found
+    assert table(resumed) == found

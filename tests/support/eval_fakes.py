@@ -228,12 +228,16 @@ class Teller(ToZero):
 
 
 def wait_for(true: Any, timeout_s: float = 120.0, every_s: float = 0.02) -> None:
-    """Poll until `true()`; `TimeoutError` if it never is."""
-    deadline = time.monotonic() + timeout_s
+    """Poll until `true()`; `TimeoutError` if it never is.
+
+    What takes long to find out, such as whether a process has ended, is asked less often: what is waited for wants CPU.
+    """
+    deadline = (begun := time.monotonic()) + timeout_s
     while not true():
-        if time.monotonic() > deadline:
+        if (now := time.monotonic()) > deadline:
             raise TimeoutError(f"waited {timeout_s:g} s for {true}")
-        time.sleep(every_s)
+        time.sleep(max(every_s, min(4 * (now - begun), 0.5)))
+        begun = time.monotonic()
 
 
 class Clock:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import re
 import secrets
 import shutil
 import subprocess
@@ -84,7 +85,10 @@ class Slurm:
         try:
             wait_for(true, timeout_s, every_s=0.2)
         except TimeoutError as error:
-            raise AssertionError(f"job {job}:\n{self.do('scontrol', 'show', 'job', job)}") from error
+            shown = self.do("scontrol", "show", "job", job)
+            [log] = re.findall(r"StdOut=(.*)", shown)
+            said = Path(log).read_text()[-3000:] if Path(log).exists() else "nothing"
+            raise AssertionError(f"job {job}:\n{shown}\nits log:\n{said}") from error
 
 
 @contextlib.contextmanager

@@ -35,7 +35,7 @@ from vlagents_ray.serve.ports import EVERYWHERE, HOST, LOOPBACK, free_port, is_f
 log = logging.getLogger(__name__)
 
 _SHUTDOWN_S = 30.0
-_PROXIES_S = 60.0  # time for Serve's proxies to listen; the first ones may be replaced
+_PROXIES_S = 180.0  # time for Serve's proxies to listen; on a busy node, several are replaced before one does
 _LOOK_S = 0.2  # interval of the checks which proxies Serve has
 _START_S, _GROW_S = 600.0, 3600.0  # time for a policy to become ready: here; on a cluster that may add a machine first
 _REMIND_S = 30.0

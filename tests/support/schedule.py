@@ -1,0 +1,78 @@
+"""What a process of pytest-xdist takes at once, and which of it begins first.
+
+Whatever takes longest begins first, so that the processes end at about the same time. `seconds.json` has the seconds of
+each file that takes long, by tier; a run with VLAGENTS_TEST_SECONDS=tests/support/seconds.json records its own there.
+"""
+
+from __future__ import annotations
+
+import itertools
+import json
+import os
+from collections import Counter
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+_SECONDS = Path(__file__).parent / "seconds.json"
+_LEAST_S = 8.0  # of a file that is recorded
+_CLUSTERS = "tests/cluster/"  # of several hosts each: one at a time, as two of them starve each other of CPU
+
+
+def unit(nodeid: str) -> str:
+    """The file of a test, or the folder whose files one process plays."""
+    return _CLUSTERS if nodeid.startswith(_CLUSTERS) else nodeid.partition("::")[0]
+
+
+def seconds(config: pytest.Config) -> Counter[str]:
+    """How long the units of a tier took, those of which that is known."""
+    found: Counter[str] = Counter()
+    for file, took in json.loads(_SECONDS.read_text()).get(config.option.markexpr, {}).items():
+        found[unit(file)] += took
+    return found
+
+
+def in_order(nodeids: Sequence[str]) -> dict[str, str]:
+    """The unit of each test, with a number that is another one where other units came between."""
+    found: dict[str, str] = {}
+    number, before = 0, ""
+    for nodeid in nodeids:
+        number += (now := unit(nodeid)) != before
+        found[nodeid], before = f"{now} {number}", now
+    return found
+
+
+@pytest.hookimpl(optionalhook=True)
+def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> Any:
+    """Where `--dist loadfile` asks for files, send units; what of one runs alone, later than the rest, is apart."""
+    if config.option.dist != "loadfile":
+        return None
+    from xdist.scheduler import LoadFileScheduling
+
+    class UnitScheduling(LoadFileScheduling):
+        units: dict[str, str] | None = None
+
+        def _split_scope(self, nodeid: str) -> str:
+            if self.units is None:
+                self.units = in_order(self.collection)
+            return self.units[nodeid]
+
+    return UnitScheduling(config, log)
+
+
+def pytest_terminal_summary(terminalreporter: Any, config: pytest.Config) -> None:
+    """Record what each file took, where that is asked for of a run in several processes."""
+    name = os.environ.get("VLAGENTS_TEST_SECONDS")
+    if name is None or not config.getoption("numprocesses", None):
+        return
+    took: Counter[str] = Counter()
+    for report in itertools.chain(*terminalreporter.stats.values()):
+        if isinstance(report, pytest.TestReport):
+            took[report.nodeid.partition("::")[0]] += report.duration
+    file = Path(name)
+    known = json.loads(file.read_text()) if file.exists() else {}
+    others = {test: s for test, s in known.get(config.option.markexpr, {}).items() if test not in took}
+    known[config.option.markexpr] = others | {test: round(s, 1) for test, s in took.items() if s >= _LEAST_S}
+    file.write_text(json.dumps(known, indent=1, sort_keys=True) + "\n")
