@@ -46,40 +46,52 @@ def outcome(protocol: Protocol) -> tuple[object, ...]:
     return events, protocol.data_to_send(), protocol.state, protocol.close_rcvd, protocol.close_sent, error
 
 
-def serialized(head: int, data: bytes, *, masked: bool, length: int = 0) -> bytes:
+def serialized(head: int, data: bytes, *, mask: bytes, length: int = 0) -> bytes:
     """Return a frame with any first byte; its length takes at least `length` bytes after the second one."""
     size = len(data)
-    bit = 0x80 * masked
+    bit = 0x80 * bool(mask)
     if size < 126 and not length:
         start = bytes([head, bit | size])
     elif size < 2**16 and length < 8:
         start = bytes([head, bit | 126]) + size.to_bytes(2, "big")
     else:
         start = bytes([head, bit | 127]) + size.to_bytes(8, "big")
-    return start + (MASK + utils.apply_mask(data, MASK) if masked else data)
+    return start + mask + (utils.apply_mask(data, mask) if mask else data)
 
 
 BINARY, PART, LAST, PING, PONG, CLOSE = 0x82, 0x02, 0x80, 0x89, 0x8A, 0x88
 HEADS = st.sampled_from([*[BINARY] * 8, PART, LAST, 0x00, 0x81, PING, PONG, CLOSE]) | st.integers(0, 255)
 DATA = st.binary(max_size=130) | st.sampled_from([b"\x03\xe8bye", 1025, 70_000, LIMIT, LIMIT + 1])  # or so many zeros
 FRAMES = st.tuples(HEADS, DATA, st.sampled_from([True] * 9 + [False]), st.sampled_from([0] * 8 + [2, 8]))
+NO_MASK = bytes(4)  # our client's, which changes nothing
 
 
 @settings(max_examples=many(400))
-@given(st.booleans(), st.lists(FRAMES, max_size=6), st.binary(max_size=20), st.lists(st.integers(1, 300), max_size=6))
-@example(True, [(PART, b"a", True, 0), (BINARY, b"b", True, 0)], b"", [])  # a message within another one
-@example(False, [(PART, b"a", True, 0), (PING, b"", True, 0), (LAST, b"b", True, 0), (BINARY, b"c", True, 0)], b"", [])
-@example(True, [(BINARY, b"a", True, 0), (CLOSE, b"\x03\xe8", True, 0), (BINARY, b"b", True, 0)], b"", [])
-@example(True, [(BINARY, b"not masked", False, 0)], b"", [])
-@example(False, [(BINARY, b"masked", False, 0)], b"", [])
-@example(True, [], b"\x82\x01a1234", [])  # as long as a masked frame
-@example(False, [], b"\x82\x81a", [])  # as long as one without a mask
-@example(True, [(0xC2, b"compressed", True, 0)], b"", [])
-@example(True, [(BINARY, b"a long length", True, 8)], b"", [])
+@given(
+    st.booleans(),
+    st.lists(FRAMES, max_size=6),
+    st.binary(max_size=20),
+    st.lists(st.integers(1, 300), max_size=6),
+    st.sampled_from([MASK, NO_MASK]),
+)
+@example(True, [(PART, b"a", True, 0), (BINARY, b"b", True, 0)], b"", [], MASK)  # a message within another one
+@example(
+    False, [(PART, b"a", True, 0), (PING, b"", True, 0), (LAST, b"b", True, 0), (BINARY, b"c", True, 0)], b"", [], MASK
+)
+@example(True, [(BINARY, b"a", True, 0), (CLOSE, b"\x03\xe8", True, 0), (BINARY, b"b", True, 0)], b"", [], MASK)
+@example(True, [(BINARY, b"not masked", False, 0)], b"", [], MASK)
+@example(False, [(BINARY, b"masked", False, 0)], b"", [], MASK)
+@example(True, [], b"\x82\x01a1234", [], MASK)  # as long as a masked frame
+@example(False, [], b"\x82\x81a", [], MASK)  # as long as one without a mask
+@example(True, [(0xC2, b"compressed", True, 0)], b"", [], MASK)
+@example(True, [(BINARY, b"a long length", True, 8)], b"", [], MASK)
 def test_any_bytes_have_the_same_effect_as_on_the_parser_of_websockets(
-    is_server: bool, sent: list[tuple[int, bytes | int, bool, int]], garbage: bytes, sizes: list[int]
+    is_server: bool, sent: list[tuple[int, bytes | int, bool, int]], garbage: bytes, sizes: list[int], mask: bytes
 ) -> None:
-    pieces = [serialized(head, bytes(data), masked=right is is_server, length=size) for head, data, right, size in sent]
+    pieces = [
+        serialized(head, bytes(data), mask=mask if right is is_server else b"", length=size)
+        for head, data, right, size in sent
+    ]
     pieces.append(garbage)
     ours, received = connected(is_server=is_server)
     theirs = opened(is_server=is_server)
@@ -140,7 +152,7 @@ def test_the_end_within_a_message_is_noticed() -> None:
 
 
 @pytest.mark.parametrize("size", [0, 125, 126, 2**16 - 1, 2**16])
-@pytest.mark.parametrize("mask", [b"", MASK])
+@pytest.mark.parametrize("mask", [b"", MASK, NO_MASK])
 def test_a_head_is_that_of_websockets(size: int, mask: bytes) -> None:
     with pytest.MonkeyPatch.context() as patched:
         patched.setattr(secrets, "token_bytes", lambda _: mask)

@@ -78,7 +78,7 @@ class ReceiveBuffer(StreamReader):
         if len(data) != begin + size or size > self._limit:
             return None
         mask = bytes(data[at:begin])
-        return frames.apply_mask(data[begin:], mask) if masked else bytes(data[begin:])  # type: ignore[attr-defined, no-any-return, unused-ignore]
+        return frames.apply_mask(data[begin:], mask) if any(mask) else bytes(data[begin:])  # type: ignore[attr-defined, no-any-return, unused-ignore]
 
     def feed_data(self, data: bytes | bytearray) -> None:
         """Add bytes, as the protocol's parser requires; raise `EOFError` after `feed_eof`."""

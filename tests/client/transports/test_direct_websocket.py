@@ -73,6 +73,8 @@ def test_a_message_arrives_whole_in_pieces_of_any_length() -> None:
             stream.send_pieces([message[: size // 3], b"", memoryview(message)[size // 3 :]], 30)
             stream.send(b"after", 30)
             assert [received.get(timeout=30) for _ in range(3)] == [b"before", message, b"after"], size
+        stream.send_pieces([b"a"] * 2000, 30)  # more than the kernel takes at once
+        assert received.get(timeout=30) == b"a" * 2000
 
 
 def test_a_server_that_closes_in_place_of_an_answer_is_a_connection_that_is_gone(stream: Stream) -> None:
