@@ -444,14 +444,18 @@ class ChunkPlayer(Agent):
         why = held or (STALE if self._is_old(self._captured(obs)) else self._trouble)
         if step is not None:
             try:
-                action = self._motion.move(step.action, obs)
-                self._plan.advance()
-                return step.played(action, tick, self._silent_s())
+                action, rows = self._motion.follow(step.action, self._plan.after, obs)
             except InvalidAction as error:
                 self._plan.drop()  # the rest of the plan assumes the result of this action
                 why = refused(error)
                 if not self._motion.can_hold:
                     raise
+            else:
+                act = step.played(action, tick, self._silent_s())
+                if not rows:  # on the way to the row
+                    return replace(act, done=False)
+                self._plan.advance()
+                return act
         if held is not None and self.control.running:  # the loop commands nothing
             action = np.zeros(0, np.float32)
         else:

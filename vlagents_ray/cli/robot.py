@@ -22,10 +22,11 @@ from vlagents_ray.client.agent import RemoteAgent
 from vlagents_ray.client.commands import CommandInbox
 from vlagents_ray.contract import Contract, require_match
 from vlagents_ray.errors import ConfigError, VLAgentsError
+from vlagents_ray.robot.limits import Limits
 from vlagents_ray.robot.loop import ROBOT, LoopReport, Restart, Robot, import_class, run_loop
 from vlagents_ray.robot.record import Recorder
 from vlagents_ray.robot.ros import RosRobot, read_settings
-from vlagents_ray.robot.safety import Guard, Watchdog, measured_state
+from vlagents_ray.robot.safety import SOFT_START_S, Guard, Watchdog, measured_state
 from vlagents_ray.robot.simulated import SimulatedRobot
 from vlagents_ray.robot.teleoperation import HELP, AxesLeader, Keyboard, SpaceMouse, Terminal
 from vlagents_ray.viewers import open_viewer
@@ -122,7 +123,10 @@ def _run(options: argparse.Namespace) -> LoopReport:
             max_age_s=options.max_age_s,
             safe=options.safe,
         )
-        guard = Guard(contract, max_step=options.max_step, measure=measured_state(options.measure))
+        limits = None if options.limits is None else Limits.read(options.limits)
+        softly: dict[str, Any] = {} if limits is None else {"hz": hz, "soft_start_s": options.soft_start_s}
+        measure = measured_state(options.measure)
+        guard = Guard(contract, max_step=options.max_step, measure=measure, limits=limits, **softly)
         player = stack.enter_context(ChunkPlayer(agent, settings, check=guard, override=leader))
         player.initialize()  # refuses unfit settings before anything is timed or moves
         robot: Robot = topics or (SimulatedRobot(contract) if make_robot is None else make_robot())
@@ -293,6 +297,12 @@ def command_parser() -> tuple[argparse.ArgumentParser, list[argparse.Action], li
     real("--safe", choices=("auto", "hold", "zero"), default="auto", help=safe)
     add("--max-step", type=_number(), help="largest change of a number of the action from one tick to the next")
     real("--measure", metavar="PART", help="part of the state with the measured pose, for --max-step, e.g. joints")
+    limits = (
+        "limits of speed, acceleration and jerk: a .yaml file, a LeRobotDataset or a .urdf; see docs/control_loop.md"
+    )
+    real("--limits", metavar="PATH", help=limits)
+    soft = "time of motion in which these rise from half of their values (%(default)s; 0: none)"
+    real("--soft-start-s", type=_number(), default=SOFT_START_S, help=soft)
     restarts = "how motion restarts after a stop: by Enter, C or SIGUSR1, or by itself (manual; auto if simulated)"
     real("--restart", choices=get_args(Restart), help=restarts)
     silence = "stop the robot when the server is silent this long (%(default)s)"

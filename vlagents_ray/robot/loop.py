@@ -143,7 +143,9 @@ def run_loop(
 ) -> LoopReport:
     """Reset an agent and let it drive a robot at a fixed rate, until it is done or the time is over.
 
-    The schedule is absolute, so there is no drift; a tick that is over before it could begin is skipped and counted as
+    With the rest pose of `Guard.limits`, the robot goes there slowly after a run that ended without a stop, a pause, a
+    mark or an exception; a mark may come from afar, from where a robot can only be made to stop. The schedule is
+    absolute, so there is no drift; a tick that is over before it could begin is skipped and counted as
     missed. `robot.stop()` is called however the loop ends. If more than half of the ticks had no action of the policy,
     `LoopReport.mostly_safe` is logged as a warning. Signals such as SIGTERM end the loop if the caller turns them into
     an exception.
@@ -176,8 +178,8 @@ def run_loop(
         The timing of the loop, and the reasons of the ticks without an action of the policy.
 
     Raises:
-        ConfigError: `hz`, `seconds` or `restart` has a wrong value, `guard` differs from the agent's own, or the
-            recorder has no columns for interventions.
+        ConfigError: `hz`, `seconds` or `restart` has a wrong value, `guard` differs from the agent's own or has limits
+            for another rate, or the recorder has no columns for interventions.
         InvalidAction: An action is a chunk, or the guard refuses it.
     """
     if restart is None:
@@ -206,6 +208,8 @@ def run_loop(
     if guard is not None and own is not None and own is not guard:
         raise ConfigError("guard: got one besides the agent's own check=, want one of them; leave one out")
     guard = guard or own or Guard(agent.contract)
+    if guard.hz not in (None, hz):
+        raise ConfigError(f"guard: got limits for {guard.hz} Hz in a loop of {hz} Hz, want the same rate")
     run = _Run(robot, agent, control, guard, watchdog, recorder, commands, LoopView(viewer), report)
     with contextlib.ExitStack() as stack:
         control.begin(auto=restart == "auto")
@@ -217,7 +221,9 @@ def run_loop(
             report.means = stack.enter_context(undisturbed(real_time=real_time))
             if watchdog is not None:
                 stack.enter_context(watchdog)
-            run.drive(Pacer(hz), seconds, until)
+            pacer = Pacer(hz)
+            run.drive(pacer, seconds, until)
+            run.go_to_rest(pacer)
             report.outcome = control.end()
             if report.outcome and recorder is not None and recorder.interventions:
                 recorder.label("success" if report.outcome == "success" else "failure")
@@ -297,6 +303,24 @@ class _Run:
             if work_s:
                 self.report.work_p50_ms = float(np.median(work_s)) * 1e3
                 self.report.work_p99_ms = float(np.quantile(work_s, 0.99)) * 1e3
+
+    def go_to_rest(self, pacer: Pacer) -> None:
+        """Move slowly to the guard's rest pose, unless the robot is held or the episode was marked."""
+        if (last := self.last) is None or self.standing:
+            return
+        try:
+            for command in self.guard.way_to_rest(last):
+                pacer.wait()
+                self.control.update()
+                if self._held(Act(last)) is not None or self.control.state == "human" or self.control.over:
+                    break
+                if self.watchdog is not None:
+                    self.watchdog.heard("loop")
+                    self.watchdog.heard("server")  # not needed for this motion
+                last = self.guard(command, last)
+                self.robot.apply(last)
+        except InvalidAction as error:
+            logger.warning("the way to the rest pose ends here: %s", error)
 
     def _held(self, act: Act) -> Held | None:
         """Obey new commands; return why this tick may command nothing, or None."""
