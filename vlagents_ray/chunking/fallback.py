@@ -184,6 +184,11 @@ class Motion:
         self._before: np.ndarray | None = None  # the last one of earlier ticks
         self._state: Literal["stopped", "moving", "held"] = "stopped"
 
+    @property
+    def speeds_up(self) -> bool:
+        """Whether the robot, coming from rest, is still slower than the plan."""
+        return self._ease is not None and self._ease.arrived and not self._ease.over
+
     def tick(self) -> None:
         """Begin a tick, at which one action may be commanded."""
         self._before = self._last

@@ -362,7 +362,9 @@ class ChunkPlayer(Agent):
         self._noted = True
 
     def _note_asked(self, tick: int, obs: Obs) -> None:
-        self._request, self._dropped = _Request(tick, self._plan.executed, self._captured(obs)), False
+        self._request = _Request(tick, self._plan.executed, self._captured(obs))
+        # A robot that speeds up is between two rows, so that the answer would begin up to a row away from it.
+        self._dropped = self._motion.speeds_up and self._plan.after is not None
 
     def _is_old(self, seen_at: float) -> bool:
         return self.settings.max_age_s is not None and seen_at < time.monotonic() - self.settings.max_age_s
@@ -390,7 +392,7 @@ class ChunkPlayer(Agent):
             return
         if isinstance(answer, Act):
             try:
-                if not self._dropped:
+                if not (self._dropped or (self._motion.speeds_up and self._plan.after is not None)):
                     self._take(answer, tick)
                 self._waiting_since = None
             except InvalidAction as error:

@@ -323,7 +323,7 @@ class Watchdog:
         self._stop = stop
         self._limits = dict(silent_s)
         self._heard = dict.fromkeys(silent_s, 0.0)
-        self._changed = threading.Condition()
+        self._changed = threading.Condition()  # reentrant
         self._thread: threading.Thread | None = None
 
     def heard(self, name: str, ago_s: float = 0.0) -> None:
@@ -397,6 +397,30 @@ class Watchdog:
     def __exit__(self, *exc: object) -> None:
         self.close()
 
+    def overdue(self) -> tuple[str | None, float | None]:
+        """Record the silence of a source whose time limit is over, and return its reason, for `bark`.
+
+        Returns:
+            The reason, or None; and the time, s, until the next limit may be over, or None.
+        """
+        with self._changed:
+            now, silent = time.monotonic(), self.control.silent
+            waiting = {n: self._heard[n] + s - now for n, s in self._limits.items() if n not in silent}
+            name = min(waiting, key=lambda n: waiting[n]) if waiting else None
+            if name is None or waiting[name] > 0:
+                return None, None if name is None else waiting[name]
+            reason = f"{name}: silent for {now - self._heard[name]:.2f} s"
+            self.control.stop(reason, silent=name)
+            return reason, None
+
+    def bark(self, reason: str) -> None:
+        """Call `stop`; its error is kept."""
+        self.barks.append(reason)
+        try:
+            self._stop(reason)
+        except Exception as error:  # noqa: BLE001 - the next silence must stop the robot as well
+            self.error = error
+
     def _watch(self) -> None:
         me = threading.current_thread()
         while True:
@@ -405,17 +429,7 @@ class Watchdog:
                 while reason is None:
                     if self._thread is not me:
                         return
-                    now = time.monotonic()
-                    silent = self.control.silent
-                    waiting = {n: self._heard[n] + s - now for n, s in self._limits.items() if n not in silent}
-                    name = min(waiting, key=lambda n: waiting[n]) if waiting else None
-                    if name is not None and waiting[name] <= 0:
-                        reason = f"{name}: silent for {now - self._heard[name]:.2f} s"
-                        self.control.stop(reason, silent=name)
-                    else:
-                        self._changed.wait(None if name is None else waiting[name])
-            self.barks.append(reason)
-            try:
-                self._stop(reason)
-            except Exception as error:  # noqa: BLE001 - the next silence must stop the robot as well
-                self.error = error
+                    reason, wait_s = self.overdue()
+                    if reason is None:
+                        self._changed.wait(wait_s)
+            self.bark(reason)
