@@ -409,6 +409,8 @@ class ChunkPlayer(Agent):
         if self.settings.mode == "open_loop" and act.done and self.settings.execute is not None:
             # A late answer keeps one row, since the last row states that the task is done.
             rows = rows[: max(self.settings.execute, self._plan.executed + 1 - step)]
+        if self._chunks == 2:  # the first answer after that of `reset` may include a cold start, of seconds
+            self._delays.pop()
         self._delays.append(now - tick)
         added = self._plan.add(Chunk(self._chunks, step, rows, act.done, act.info, tick, seen_at))
         self._chunks += 1

@@ -15,6 +15,8 @@ import threading
 from collections.abc import Callable, Iterator, Sequence
 from typing import Any, get_args
 
+import numpy as np
+
 from vlagents_ray.chunking.buffer import ENSEMBLE, MERGES, Mode
 from vlagents_ray.chunking.control import Leader
 from vlagents_ray.chunking.player import ChunkPlayer, PlayerSettings
@@ -22,6 +24,8 @@ from vlagents_ray.client.agent import RemoteAgent
 from vlagents_ray.client.commands import CommandInbox
 from vlagents_ray.contract import Contract, require_match
 from vlagents_ray.errors import ConfigError, VLAgentsError
+from vlagents_ray.interface import Obs
+from vlagents_ray.robot.fit import Trained, require_fit
 from vlagents_ray.robot.limits import Limits
 from vlagents_ray.robot.loop import ROBOT, LoopReport, Restart, Robot, import_class, run_loop
 from vlagents_ray.robot.record import Recorder
@@ -130,6 +134,8 @@ def _run(options: argparse.Namespace) -> LoopReport:
         player = stack.enter_context(ChunkPlayer(agent, settings, check=guard, override=leader))
         player.initialize()  # refuses unfit settings before anything is timed or moves
         robot: Robot = topics or (SimulatedRobot(contract) if make_robot is None else make_robot())
+        if options.trained_on is not None:
+            _require_fit(options, agent, robot.observe(), limits)
         recorder = None
         if options.record:
             recorder = stack.enter_context(Recorder(options.record, hz, interventions=leader is not None))
@@ -172,6 +178,18 @@ def _run(options: argparse.Namespace) -> LoopReport:
     if viewer is not None:
         say(viewer.report())
     return report
+
+
+def _require_fit(options: argparse.Namespace, agent: RemoteAgent, obs: Obs, limits: Limits | None) -> None:
+    """Compare the training of the checkpoint with the arm, before it moves."""
+    agent.reset(obs, options.instruction)
+    contract = agent.contract
+    parts = [obs.state[name] for name in (contract and contract.state) or {} if name in obs.state]
+    if contract is not None and contract.gripper and obs.gripper is not None:
+        parts.append(np.array([obs.gripper]))
+    state = np.concatenate(parts) if parts else None
+    misfits = Trained.read(options.trained_on).misfits(state, agent.act(obs).rows(), limits)
+    require_fit(misfits, accept=options.accept_misfit)
 
 
 def _leader(
@@ -303,6 +321,11 @@ def command_parser() -> tuple[argparse.ArgumentParser, list[argparse.Action], li
     real("--limits", metavar="PATH", help=limits)
     soft = "time of motion in which these rise from half of their values (%(default)s; 0: none)"
     real("--soft-start-s", type=_number(), default=SOFT_START_S, help=soft)
+    trained = (
+        "refuse to move unless state, first chunk and --limits fit these statistics of the training: stats.json, …"
+    )
+    real("--trained-on", metavar="FILE", help=trained)
+    real("--accept-misfit", action="store_true", help="move although they do not fit; the log shows it")
     restarts = "how motion restarts after a stop: by Enter, C or SIGUSR1, or by itself (manual; auto if simulated)"
     real("--restart", choices=get_args(Restart), help=restarts)
     silence = "stop the robot when the server is silent this long (%(default)s)"
