@@ -101,7 +101,7 @@ class DayReport:
     normal_step: float = 0.0  # rad
     largest_step: float = 0.0  # rad
     faults: dict[str, int] = field(default_factory=dict)
-    held: dict[str, int] = field(default_factory=dict)  # ticks without an action of the policy, by cause
+    held: dict[str, int] = field(default_factory=dict)  # ticks without the policy, by cause, in whole runs
     violations: list[str] = field(default_factory=list)
     digest: str = ""  # of all commands
 

@@ -4,12 +4,15 @@ from __future__ import annotations
 
 import json
 import logging
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from vlagents_ray import ConfigError
+from vlagents_ray import Act, ActionSpec, Agent, ConfigError, Contract, Obs
+from vlagents_ray.cli.robot import _require_fit, parse
+from vlagents_ray.contract import StateSpec
 from vlagents_ray.errors import ContractMismatch
 from vlagents_ray.robot import Limits
 from vlagents_ray.robot.fit import Trained, require_fit
@@ -79,3 +82,20 @@ def test_an_accepted_misfit_is_logged(caplog: pytest.LogCaptureFixture) -> None:
     with caplog.at_level(logging.WARNING):
         require_fit(["state[0]: got 57"], accept=True)
     assert "state[0]: got 57" in caplog.text
+
+
+def test_the_command_compares_the_arm_in_the_order_of_the_contract(tmp_path: Path) -> None:
+    class Still(Agent):
+        contract = Contract(state={"joints": StateSpec(2)}, gripper=True, action=ActionSpec(dim=3))
+
+        def act(self, obs: Obs) -> Act:
+            return Act(np.zeros((4, 3), np.float32))
+
+    ranges = {"min": LOW, "max": HIGH}
+    (tmp_path / "stats.json").write_text(json.dumps({"observation.state": ranges, "action": ranges}))
+    given = ["http://gpu-box:8000", "--trained-on", str(tmp_path / "stats.json")]
+    far = Obs(gripper=1.0, state={"joints": np.array([57, 0], np.float32)})
+    _require_fit(parse(given), Still(), replace(far, state={"joints": np.zeros(2, np.float32)}), None)
+    with pytest.raises(ContractMismatch, match="degrees for radians"):
+        _require_fit(parse(given), Still(), far, None)
+    _require_fit(parse([*given, "--accept-misfit"]), Still(), far, None)

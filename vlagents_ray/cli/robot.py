@@ -24,7 +24,7 @@ from vlagents_ray.client.agent import RemoteAgent
 from vlagents_ray.client.commands import CommandInbox
 from vlagents_ray.contract import Contract, require_match
 from vlagents_ray.errors import ConfigError, VLAgentsError
-from vlagents_ray.interface import Obs
+from vlagents_ray.interface import Agent, Obs
 from vlagents_ray.robot.fit import Trained, require_fit
 from vlagents_ray.robot.limits import Limits
 from vlagents_ray.robot.loop import ROBOT, LoopReport, Restart, Robot, import_class, run_loop
@@ -180,7 +180,7 @@ def _run(options: argparse.Namespace) -> LoopReport:
     return report
 
 
-def _require_fit(options: argparse.Namespace, agent: RemoteAgent, obs: Obs, limits: Limits | None) -> None:
+def _require_fit(options: argparse.Namespace, agent: Agent, obs: Obs, limits: Limits | None) -> None:
     """Compare the training of the checkpoint with the arm, before it moves."""
     agent.reset(obs, options.instruction)
     contract = agent.contract
