@@ -70,7 +70,7 @@ demo: setup
 reference: setup
 	BIN=$(BIN) reference/make.sh
 
-# Some minutes; the other policy servers get an environment of their own, in .venv-peers.
+# More than half an hour; the other policy servers get two environments of their own, .venv-peers and .venv-peers-torch.
 bench: setup
 	$(BIN)/python -m benchmarks.peers
 	$(BIN)/python -m benchmarks.report

@@ -20,8 +20,17 @@ class Driver(Protocol):
         """Make calls; returns their durations, ms."""
 
 
+class ProcessDriver(Driver, Protocol):
+    """A driver whose client is another process."""
+
+    pid: int  # of the client, once it is ready
+    server_pid: int | None  # of the process that has started its server; None: this one
+
+
 class ClientProcess(LineProcess):
     """A client in a process, which runs `vlagents_ray.bench.line_client.obey`."""
+
+    server_pid: int | None = None
 
     def ready(self) -> dict[str, Any]:
         """Read the first line of a client, its description, which it writes when it is connected and warm."""

@@ -1,4 +1,4 @@
-"""Environments of the measurements: a tabletop that records its times, and one that takes time but no CPU.
+"""Environments of the measurements: any one that records its times, and one that takes time but no CPU.
 
 It imports only the standard library, numpy and this package's light part, since the peers' Python imports it as well.
 """
@@ -14,11 +14,11 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from vlagents_ray.contract import ActionSpec, CameraSpec, Contract
-from vlagents_ray.envs.base import EvalEnv, one_row
-from vlagents_ray.envs.tabletop import Tabletop
+from vlagents_ray.envs.base import EvalEnv, known_contract, make_env, one_row
+from vlagents_ray.envs.graphics import Renderer
 from vlagents_ray.interface import Act, Obs
 
-TIMED_TABLETOP = "benchmarks.environments:TimedTabletop"  # its name for `make_env`
+TIMED_ENV = "benchmarks.environments:TimedEnv"  # its name for `make_env`
 SLEEPING_ENV = "benchmarks.environments:SleepingEnv"
 ACTION_DIM = 4  # of the latter
 
@@ -32,38 +32,69 @@ class EpisodeTimes(NamedTuple):
     seed: int
 
 
-class TimedTabletop(Tabletop):
-    """The tabletop, which writes the begin and end of each episode to a file for each process.
+class TimedEnv(EvalEnv):
+    """Any environment, which writes the begin and end of each episode to a file for each process.
 
-    `notes` is the folder; `step_ms` is additional CPU time of each step, in place of a simulator's physics.
+    Episode `seed` begins in initial state `seed` modulo their number, whoever resets it.
     """
 
-    def __init__(self, *, notes: str, size: int = 224, max_steps: int = 80, step_ms: float = 0.0) -> None:
-        super().__init__(width=size, height=size, max_steps=max_steps)
+    def __init__(
+        self, *, notes: str, env: str = "tabletop", size: int = 224, max_steps: int = 80, step_ms: float = 0.0
+    ) -> None:
+        """Make the environment.
+
+        Args:
+            notes: The folder of the files.
+            env: The name of the environment.
+            size: Pixels a side of its images.
+            max_steps: Its step limit.
+            step_ms: Additional CPU time of each step, in place of a simulator's physics.
+        """
+        self._env = make_env(env, width=size, height=size, max_steps=max_steps)
+        self.max_steps, self.init_states = self._env.max_steps, self._env.init_states
         self._notes = Path(notes)
         self._step_s = step_ms / 1e3
         self._begun = 0.0
-        self._seed = 0
+        self._seed = self._steps = 0
 
     @classmethod
-    def known_contract(cls, arguments: Mapping[str, Any]) -> Contract:
-        """Of our arguments, or of the tabletop's, whose constructor calls this."""
-        size = {"width": arguments["size"], "height": arguments["size"]} if "size" in arguments else {}
-        return super().known_contract({**arguments, **size})
+    def known_contract(cls, arguments: Mapping[str, Any]) -> Contract | None:
+        return known_contract(arguments["env"], dict.fromkeys(("width", "height"), arguments["size"]))
+
+    @property
+    def contract(self) -> Contract:
+        return self._env.contract
+
+    @property
+    def instruction(self) -> str:
+        return self._env.instruction
+
+    def renderer(self) -> Renderer | None:
+        return self._env.renderer()
+
+    def describe(self) -> dict[str, Any]:
+        return self._env.describe()
 
     def reset(self, *, seed: int, options: Mapping[str, Any] | None = None) -> tuple[Obs, dict[str, Any]]:
-        self._begun, self._seed = time.time(), seed
-        return super().reset(seed=seed, options=options)
+        self._begun, self._seed, self._steps = time.time(), seed, 0
+        if options is None and self.init_states:
+            options = {"init_state": seed % self.init_states}
+        return self._env.reset(seed=seed, options=options)
 
     def step(self, act: Act) -> tuple[Obs, float, bool, bool, dict[str, Any]]:
         until = time.thread_time() + self._step_s  # CPU time: wall time would pass while others have the core
-        found = super().step(act)
+        self._env.looked_at = self.looked_at
+        found = self._env.step(act)
         while self._step_s and time.thread_time() < until:
             pass
+        self._steps += 1
         if found[3]:  # truncated: nothing else ends it
             with (self._notes / f"{os.getpid()}.txt").open("a") as file:
                 file.write(f"{self._begun!r} {time.time()!r} {self._steps} {self._seed}\n")
         return found
+
+    def close(self) -> None:
+        self._env.close()
 
 
 def read_episode_times(folder: Path) -> dict[int, list[EpisodeTimes]]:

@@ -1,13 +1,18 @@
 """Episodes a minute of whole evaluations, ours and the peers' own, in alternating rounds on one machine.
 
-Each system plays the same episodes of one environment (`environments.TimedTabletop`: same code, image size, step limit
-and seeds) with a policy that does nothing behind its own server, by its own command, and keeps its results. A round
-runs each system once:
+Each system plays the same episodes of one environment (`environments.TimedEnv`: same code, image size, step limit,
+seeds and initial states) with a policy that does nothing behind its own server, by its own command, and keeps its
+results. A round runs each system once:
 
 - ours: `vlagents-ray eval`, which serves the policy for the length of the run;
 - vlagents: `run-eval`, over shared memory. It plays one configuration in one process, its first variant here; the
   second splits the episodes into one configuration for each worker, each with its own process and server;
-- vla-eval: one model server, and as many shards as `vlagents-ray eval` has workers, without Docker.
+- vla-eval: one model server, and as many shards as `vlagents-ray eval` has workers, without Docker;
+- lerobot: `lerobot-eval`, the policy in its process, with as many environments, which it steps one after another.
+
+`--env` names a simulator: it must be installed in this Python and, with the peers, in `--peers-python`
+(`peers/requirements-simulators.txt` has LIBERO and ManiSkill; vlagents, which needs numpy 1, cannot be there). With
+`--chunk 8` our policy returns as many rows, and images between two requests are not rendered; peers render each step.
 
 For ours, summary.json also has the shares of the time in which the simulators and the policy were busy.
 
@@ -34,20 +39,27 @@ import typer
 
 import vlagents_ray
 from benchmarks.console import Json, save, show_skipped
-from benchmarks.environments import TIMED_TABLETOP, read_episode_times
-from benchmarks.peers import PYTHON, SCRIPTS, PeersPython, peer_clients
+from benchmarks.environments import TIMED_ENV, read_episode_times
+from benchmarks.peers import PYTHON, SCRIPTS, PeersPython, installed
 from benchmarks.report import evaluation_outcomes, show_outcomes
 from vlagents_ray.bench.line_process import LineProcess, ProcessFailed, our_environment
 from vlagents_ray.cli.console import errors, out, progress, table
 from vlagents_ray.cli.options import parse_list
+from vlagents_ray.envs.base import known_contract
 from vlagents_ray.errors import ConfigError
 from vlagents_ray.evaluate.results.summary import FILE as SUMMARY
-from vlagents_ray.evaluate.workers.cluster import THREAD_VARIABLES
+from vlagents_ray.evaluate.workers.rollout import THREAD_VARIABLES
 from vlagents_ray.serve.ports import LOOPBACK, free_block
 
 OURS = "vlagents-ray"
 SPLIT = "vlagents, split"  # into a configuration for each worker
-PEERS = ("vlagents", "vla-eval")
+PEERS = {"vlagents": "vlagents_peer.py", "vla-eval": "vla_eval_peer.py", "lerobot": "lerobot_eval_peer.py"}  # scripts
+_SIMULATORS = "vlagents-ray env make benchmarks/peers/requirements-simulators.txt --light --into .venv-peers-simulators"
+_CURES = {
+    "vlagents": "`python -m benchmarks.peers` makes an environment",
+    "vla-eval": f"`python -m benchmarks.peers` makes an environment, with simulators `{_SIMULATORS}`",
+    "lerobot": f"`{_SIMULATORS}` makes an environment",
+}
 _MOST_S = 3600.0  # for one command
 
 
@@ -56,19 +68,28 @@ class EvaluationPlan:
     """The episodes that all systems play."""
 
     episodes: int = 200  # in all
-    workers: int = 2
+    workers: int = 2  # 0: `vlagents-ray eval` plays in its own process
     rounds: int = 3
     size: int = 224  # pixels a side
     max_steps: int = 80  # nothing else ends an episode
     step_ms: float = 0.0  # additional CPU time of each env step
+    name: str = "tabletop"  # of the environment
+    chunk: int = 1  # rows of an answer of ours
 
     def __post_init__(self) -> None:
-        if self.episodes % self.workers:
+        if self.episodes % max(1, self.workers):
             raise ConfigError(f"episodes: got {self.episodes}, want a multiple of the {self.workers} workers")
 
     def env(self, notes: Path) -> dict[str, Any]:
         """Return the options of the environment."""
-        return {"notes": str(notes), "size": self.size, "max_steps": self.max_steps, "step_ms": self.step_ms}
+        options = {"size": self.size, "max_steps": self.max_steps, "step_ms": self.step_ms}
+        return {"notes": str(notes), "env": self.name, **options}
+
+    @property
+    def action_dim(self) -> int:
+        """The numbers of an action."""
+        contract = known_contract(self.name, {})
+        return 7 if contract is None else contract.action.dim or 7  # LIBERO's, and ManiSkill's by default
 
 
 class Played(NamedTuple):
@@ -76,6 +97,7 @@ class Played(NamedTuple):
 
     episodes_per_minute: float  # from the first reset to the last step
     wall_s: float  # of the whole command
+    first_s: float | None = None  # from the start of the command to the first reset
     env_busy: float | None = None  # share of the workers' time, of ours alone
     policy_busy: float | None = None  # share of the replica's time, of ours alone
 
@@ -91,14 +113,15 @@ def measure_evaluation(
     progress: Callable[[str], None] = lambda _: None,
 ) -> dict[str, Any]:
     """Measure all systems; returns plain JSON values. Peers that cannot run here are in `skipped`, with the reason."""
-    wanted = PEERS if "all" in peers else peers
+    wanted = list(PEERS) if "all" in peers else peers
     if unknown := set(wanted) - set(PEERS):
         raise ConfigError(f"peers: got {sorted(unknown)}, want some of {list(PEERS)}, or 'all'")
-    found, skipped, versions = peer_clients(wanted, peers_python)
-    scripts = {way.peer: SCRIPTS / way.script for way in found}
+    versions = installed(peers_python, list(PEERS)) if wanted and peers_python.is_file() else {}
+    scripts = {peer: SCRIPTS / PEERS[peer] for peer in wanted if peer in versions}
+    skipped = {peer: f"not installed for {peers_python}; {_CURES[peer]}" for peer in wanted if peer not in versions}
     rounds: dict[str, list[Played]] = {}
     with tempfile.TemporaryDirectory() as top:
-        runs = {OURS: _ours(plan)} | their_runs(plan, scripts, peers_python, alone(Path(top)))
+        runs = {OURS: our_run(plan)} | their_runs(plan, scripts, peers_python, alone(Path(top)))
         for number in range(plan.rounds):
             for name, run in runs.items():
                 folder = Path(top) / f"{name} {number}"
@@ -122,9 +145,9 @@ def play(plan: EvaluationPlan, run: Run, folder: Path) -> Played:
     """Run the plan with one system. Raises `ProcessFailed` if it did not play exactly those episodes."""
     notes = folder / "notes"
     notes.mkdir(parents=True)
-    begun = time.monotonic()
+    begun = time.time()  # the clock of the notes
     run(folder, notes)
-    wall_s = time.monotonic() - begun
+    wall_s = time.time() - begun
     episodes = [note for each in read_episode_times(notes).values() for note in each]
     seeds, steps = sorted(note.seed for note in episodes), {note.steps for note in episodes}
     if seeds != list(range(plan.episodes)) or steps != {plan.max_steps}:
@@ -132,10 +155,12 @@ def play(plan: EvaluationPlan, run: Run, folder: Path) -> Played:
             f"{folder.name}: played {len(episodes)} episodes with {len(set(seeds))} seeds and {sorted(steps)} steps, "
             f"want each of {plan.episodes} once with {plan.max_steps}; its results stand for something else"
         )
-    playing_s = max(note.ended for note in episodes) - min(note.begun for note in episodes)
+    first = min(note.begun for note in episodes)
+    playing_s = max(note.ended for note in episodes) - first
     summary = folder / "results" / SUMMARY
     found = json.loads(summary.read_text()) if summary.is_file() else {}
-    return Played(60 * plan.episodes / playing_s, wall_s, found.get("env_busy"), found.get("policy_busy"))
+    busy = found.get("env_busy"), found.get("policy_busy")
+    return Played(60 * plan.episodes / playing_s, wall_s, first - begun, *busy)
 
 
 def ratios(ours: Sequence[Played], theirs: Sequence[Played]) -> dict[str, Any]:
@@ -160,12 +185,14 @@ def alone(folder: Path) -> dict[str, str]:
     return {"PYTHONPATH": f"{place}{os.pathsep}{SCRIPTS}"} | dict.fromkeys(THREAD_VARIABLES, "1")
 
 
-def _ours(plan: EvaluationPlan) -> Run:
+def our_run(plan: EvaluationPlan) -> Run:
+    """Return the run of `vlagents-ray eval`, which serves the policy or, without workers, plays it itself."""
+
     def run(folder: Path, notes: Path) -> None:
         settings = [f"--env-set={name}={value}" for name, value in plan.env(notes).items()]
         command = [
             sys.executable, "-c", "from vlagents_ray.cli import main; main()",
-            "eval", TIMED_TABLETOP, "--policy=noop", "--set=action_dim=4",
+            "eval", TIMED_ENV, "--policy=noop", f"--set=action_dim={plan.action_dim}", f"--set=chunk={plan.chunk}",
             f"--episodes={plan.episodes}", f"--workers={plan.workers}", "--video=none", f"--out={folder / 'results'}",
             *settings,
         ]  # fmt: skip
@@ -185,6 +212,7 @@ def their_runs(
     def way(name: str, peer: str, workers: int) -> Run:
         def run(folder: Path, notes: Path) -> None:
             words = {"folder": str(folder), "episodes": plan.episodes, "workers": workers, "seed": 0}
+            words["action_dim"] = plan.action_dim
             given = json.dumps(words | {"env": plan.env(notes)})
             port = str(free_block(workers))
             with LineProcess(
@@ -201,8 +229,8 @@ def their_runs(
 
 
 def _median(rounds: Sequence[Played]) -> Played:
-    rates, walls, *busy = zip(*rounds, strict=True)
-    known = (None if None in shares else statistics.median(shares) for shares in busy)
+    rates, walls, *others = zip(*rounds, strict=True)
+    known = (None if None in column else statistics.median(column) for column in others)
     return Played(statistics.median(rates), statistics.median(walls), *known)
 
 
@@ -213,7 +241,7 @@ def show_evaluation(found: Mapping[str, Any]) -> None:
         "", "episodes/min", "whole command s", "simulators busy", "policy busy", "ours / theirs", "wall: theirs / ours"
     )
     rows.title = (
-        f"{plan['episodes']} episodes of {plan['max_steps']} steps, {plan['size']}x{plan['size']}, "
+        f"{plan['episodes']} episodes of {plan['max_steps']} steps of {plan['name']}, {plan['size']}x{plan['size']}, "
         f"{plan['workers']} workers on {found['cores']} cores, medians of {plan['rounds']} rounds"
     )
     for name, row in found["medians"].items():
@@ -229,11 +257,15 @@ def show_evaluation(found: Mapping[str, Any]) -> None:
 def main(
     episodes: Annotated[int, typer.Option(min=1, help="Of each system and round.")] = 200,
     workers: Annotated[int, typer.Option(min=1)] = 2,
-    peers: Annotated[str, typer.Option(help="vlagents, vla-eval, with a comma between them, or 'all'.")] = "",
+    peers: Annotated[str, typer.Option(help="vlagents, vla-eval, lerobot, with commas between them, or 'all'.")] = "",
     rounds: Annotated[int, typer.Option(min=1)] = 3,
     size: Annotated[int, typer.Option(min=32, help="Pixels a side of the image.")] = 224,
     max_steps: Annotated[int, typer.Option(min=1, help="Steps of an episode.")] = 80,
     env_ms: Annotated[float, typer.Option(min=0, help="CPU time that each env step takes more.")] = 0.0,
+    env: Annotated[
+        str, typer.Option(help="The environment: libero/libero_spatial/0, maniskill/PushCube-v1.")
+    ] = "tabletop",
+    chunk: Annotated[int, typer.Option(min=1, help="Rows of each answer of ours, all of which are executed.")] = 1,
     peers_python: PeersPython = PYTHON,
     json_file: Json = None,
     report: Annotated[
@@ -242,7 +274,7 @@ def main(
 ) -> None:
     """Measure episodes a minute of whole evaluations: `vlagents-ray eval`, and the peers' own commands, in turns."""
     with errors():
-        plan = EvaluationPlan(episodes, workers, rounds, size, max_steps, env_ms)
+        plan = EvaluationPlan(episodes, workers, rounds, size, max_steps, env_ms, env, chunk)
         found = measure_evaluation(plan, peers=parse_list(peers), peers_python=peers_python, progress=progress)
     show_evaluation(found)
     save(found, json_file)

@@ -1,6 +1,6 @@
-"""The process that carries a link between two hosts: `python -m benchmarks.far_carrier PID PID`, the first process of
-each.
+"""The process that carries a link between two hosts: `python -m benchmarks.far_carrier DEVICE PID PID`.
 
+It gets the device's name in the hosts, and the first process of each.
 It answers each line of `Conditions` with a line. It imports only the standard library, so that it starts at once.
 """
 
@@ -18,7 +18,7 @@ import sys
 import time
 from dataclasses import dataclass
 
-DEVICE = "far"  # its name in either host
+DEVICE = "far"  # its name in either host, unless a host has several
 _TUNSETIFF, _IFF_TUN, _IFF_NO_PI = 0x400454CA, 0x0001, 0x1000  # linux/if_tun.h
 _QUEUE_S = 0.2  # delay of a full queue of the link; further packets are dropped
 
@@ -36,10 +36,11 @@ class Conditions:
 class _Carrier:
     """The two devices, and the packets on their way."""
 
-    def __init__(self, pids: list[str]) -> None:
-        self._devices = [_device(f"far{number}") for number in range(2)]
-        for number, pid in enumerate(pids):
-            subprocess.run(["ip", "link", "set", f"far{number}", "netns", pid, "name", DEVICE], check=True)  # noqa: S607
+    def __init__(self, device: str, *pids: str) -> None:
+        names = [f"{device}-{number}" for number in range(2)]  # in the switch
+        self._devices = [_device(name) for name in names]
+        for name, pid in zip(names, pids, strict=True):
+            subprocess.run(["ip", "link", "set", name, "netns", pid, "name", device], check=True)  # noqa: S607
         self._conditions = Conditions()
         self._way: list[tuple[float, int, int, bytes]] = []  # due time, number, device, and the packet
         self._count = 0
@@ -101,7 +102,7 @@ def _device(name: str) -> int:
 
 def main() -> None:
     """Run the process of the link, in the network namespace of the switch."""
-    carrier = _Carrier(sys.argv[1:])
+    carrier = _Carrier(*sys.argv[1:])
     print("true", flush=True)  # noqa: T201 - it is there
     carrier.run()
 

@@ -28,21 +28,31 @@ _ANSWER_S = 10.0
 class FarLink:
     """A link between two hosts, and its process."""
 
-    def __init__(self, one: Host, other: Host, congestion: str = "cubic") -> None:
-        """Name the ends, and TCP's congestion control, "cubic" or "bbr"; the link begins with `with`."""
-        self.address, self.other_address = _ADDRESSES
-        self._ends, self._congestion = (one, other), congestion
+    def __init__(self, one: Host, other: Host, congestion: str = "cubic", device: str = "", own: bool = False) -> None:
+        """Prepare the link, which begins with `with`.
+
+        Args:
+            one: The host of `address`.
+            other: That of `other_address`.
+            congestion: TCP's congestion control, "cubic" or "bbr".
+            device: The name of the device in either host, if a host has several.
+            own: Whether the link carries what is sent to the hosts' own addresses, in place of two further ones.
+        """
+        self._addresses = (one.address, other.address) if own else _ADDRESSES
+        self.address, self.other_address = self._addresses
+        self._ends, self._congestion, self._device = (one, other), congestion, device or DEVICE
 
     def __enter__(self) -> FarLink:
         command = ["setpriv", "--pdeathsig=KILL", "nsenter", f"--target={self._ends[0].switch}", "--net"]
-        command += [sys.executable, "-m", "benchmarks.far_carrier", *(str(host.pid) for host in self._ends)]
+        command += [sys.executable, "-m", "benchmarks.far_carrier", self._device]
+        command += [str(host.pid) for host in self._ends]
         self._process = LineProcess("the link", command, our_environment())
         try:
             self._process.read(_START_S)
-            for host, near, far in zip(self._ends, _ADDRESSES, reversed(_ADDRESSES), strict=True):
-                host.run(["ip", "address", "add", near, "peer", far, "dev", DEVICE])
-                host.run(["ip", "link", "set", DEVICE, "mtu", str(_MTU), "up"])
-                host.run(["ip", "route", "replace", far, "dev", DEVICE, "congctl", self._congestion])
+            for host, near, far in zip(self._ends, self._addresses, reversed(self._addresses), strict=True):
+                host.run(["ip", "address", "add", near, "peer", far, "dev", self._device])
+                host.run(["ip", "link", "set", self._device, "mtu", str(_MTU), "up"])
+                host.run(["ip", "route", "replace", far, "dev", self._device, "congctl", self._congestion])
         except BaseException:
             self._process.close()
             raise

@@ -61,6 +61,19 @@ def median_interval(values: np.ndarray) -> tuple[float, float]:
     return float(ordered[low]), float(ordered[high])
 
 
+# The 0.975 quantiles of Student's t distribution for 1, 2, … degrees of freedom.
+_T = (12.706, 4.303, 3.182, 2.776, 2.571, 2.447, 2.365, 2.306, 2.262)
+
+
+def mean_interval(rounds: Sequence[float]) -> tuple[float, float] | None:
+    """Return the 95 % interval of the mean of 2 to 10 rounds, by Student's t; None for a single one."""
+    n = len(rounds)
+    if n < 2:
+        return None
+    half = _T[min(n - 2, len(_T) - 1)] * float(np.std(rounds, ddof=1)) / n**0.5
+    return float(np.mean(rounds)) - half, float(np.mean(rounds)) + half
+
+
 def median_ratio(ours: RoundTrips, theirs: RoundTrips, *, seed: int = 0) -> Ratio:
     """Return the ratio of the two medians.
 

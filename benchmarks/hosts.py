@@ -14,6 +14,7 @@ that made them, however that ends. Needs Linux and root.
 from __future__ import annotations
 
 import contextlib
+import json
 import os
 import secrets
 import shutil
@@ -92,6 +93,11 @@ class Host:
         for words in shaping(rate, None):
             self._switch(["tc", "qdisc", "replace", "dev", f"port{self.number}", *words])
             self.run(["tc", "qdisc", "replace", "dev", "eth0", *words])
+
+    def sent_bytes(self) -> int:
+        """Return the bytes that it has sent to other hosts so far, with headers."""
+        links = json.loads(self.run(["ip", "-json", "-statistics", "link"]))
+        return sum(link["stats64"]["tx"]["bytes"] for link in links if link["ifname"] != "lo")
 
     def kill(self) -> None:
         """Kill all its processes at once, as a power failure does."""

@@ -21,7 +21,6 @@ import textwrap
 import time
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from pathlib import Path
 from typing import Annotated, Any, NamedTuple
 
 import numpy as np
@@ -31,6 +30,7 @@ from websockets.sync.client import connect
 from benchmarks.console import Json, save
 from benchmarks.drivers import START_S
 from benchmarks.own_clients import observation
+from benchmarks.processes import cpu_seconds
 from vlagents_ray.bench.line_client import die_with_parent, own_stdout
 from vlagents_ray.bench.line_process import LineProcess, our_environment
 from vlagents_ray.cli.console import errors, out, progress, table
@@ -125,8 +125,8 @@ def measure_live(
             "holding": deployment("benchmarks.live:Measured", config=_CONFIG, live={"folder": folder}),
         }
         apps = [one.applications[0] for one in made.values()]
-        for name, app in zip(made, apps, strict=True):
-            app.name, app.route_prefix = name, f"/{name}"
+        for name, one in zip(made, apps, strict=True):
+            one.name, one.route_prefix = name, f"/{name}"
         server = stack.enter_context(running_server(made["tapped"].model_copy(update={"applications": apps})))
         fleets = {app.name: Robots(stack, app.name, server.apps[app.name], transport) for app in apps}
         watching = [
@@ -168,18 +168,12 @@ def _turn(robots: Robots, watching: Sequence[LineProcess], seconds: float) -> Tu
     for viewer in watching:
         viewer.send(json.dumps(seconds + 2 * _WARM_S))
     time.sleep(_WARM_S)
-    before = _cpu_ms(robots.replica)
+    before = cpu_seconds(robots.replica)
     paced, saturated = robots.act(seconds)
-    cpu_ms = (_cpu_ms(robots.replica) - before) / (len(paced) + len(saturated))
+    cpu_ms = 1e3 * (cpu_seconds(robots.replica) - before) / (len(paced) + len(saturated))
     seen = [viewer.read(seconds + START_S) for viewer in watching]
     messages, size = (sum(one[i] for one in seen) / (seconds + 2 * _WARM_S) for i in (0, 1))
     return Turn(len(saturated) / seconds, cpu_ms, saturated, paced, messages, size / 1e6)
-
-
-def _cpu_ms(pid: int) -> float:
-    """Return the CPU time of a process so far, ms."""
-    fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
-    return (int(fields[11]) + int(fields[12])) * 1e3 / os.sysconf("SC_CLK_TCK")
 
 
 def _figures(turns: list[Turn], base: list[Turn]) -> dict[str, Any]:

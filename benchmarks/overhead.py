@@ -27,19 +27,19 @@ import numpy as np
 import typer
 
 from benchmarks.console import Json, save
+from benchmarks.processes import cpu_seconds
 from vlagents_ray.cli.console import errors, out, progress, table
 from vlagents_ray.cli.options import parse_settings
 from vlagents_ray.envs import make_env
 from vlagents_ray.errors import EnvFailed
 from vlagents_ray.evaluate import EvalConfig, PolicyConfig, SuiteConfig, evaluate
-from vlagents_ray.evaluate.workers.cluster import THREAD_VARIABLES
+from vlagents_ray.evaluate.workers.rollout import THREAD_VARIABLES
 from vlagents_ray.interface import Act
 from vlagents_ray.ray_tools.reaper import MARK, marked
 from vlagents_ray.serve.launch.deployment_file import deployment
 from vlagents_ray.serve.launch.server import running_server
 
 _START_S = 600.0
-_TICK_S = 1.0 / os.sysconf("SC_CLK_TCK")
 _EVERY_S = 0.2
 _LOOK_EVERY = 5  # samples between two searches for processes
 
@@ -219,12 +219,6 @@ def recorded(out: Path) -> list[Span]:
     with contextlib.closing(sqlite3.connect(out / "results.db")) as db:
         rows = db.execute("SELECT finished - seconds, finished, steps FROM episodes").fetchall()
     return [Span(*row) for row in rows]
-
-
-def cpu_seconds(pid: int) -> float:
-    """Return the user and system CPU time of a process so far, all its threads, s. `OSError` if it has ended."""
-    fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
-    return (int(fields[11]) + int(fields[12])) * _TICK_S  # utime and stime of proc_pid_stat(5)
 
 
 class CpuSampler:

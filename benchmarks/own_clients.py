@@ -9,9 +9,8 @@ import contextlib
 import functools
 import inspect
 import json
-import random
+import os
 import sys
-import time
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
@@ -20,7 +19,8 @@ from typing import Any, get_args
 
 import numpy as np
 
-from benchmarks.drivers import CALL_S, START_S, ClientProcess, Driver
+from benchmarks.closed_loop import Call, ClosedLoop
+from benchmarks.drivers import CALL_S, START_S, ClientProcess, ProcessDriver
 from vlagents_ray.bench.line_client import WARM_UP, die_with_parent, obey, own_stdout, timed
 from vlagents_ray.bench.line_process import our_environment
 from vlagents_ray.client.agent import RemoteAgent
@@ -29,9 +29,7 @@ from vlagents_ray.errors import ConfigError
 from vlagents_ray.images.codecs import ImageCodec
 from vlagents_ray.interface import Obs
 
-Call = tuple[float, float, float, int]  # ended, s of time.monotonic; round trip, ms; inference, ms; size of its batch
 ROBOT, SIMULATION = "robot", "simulation"
-_THINK_S = 0.05  # longest pause of a robot after an answer, so that it meets batches at any stage
 
 
 @functools.cache
@@ -116,7 +114,11 @@ class BenchCaller:
         self._agent = connect(url, transport, codec)
         self._obs = observation()
         info = self._agent.reset(self._obs, "measure")
-        self.description: dict[str, Any] = {"transport": self._agent.transport, "psnr_db": info.get("psnr_db")}
+        self.description: dict[str, Any] = {
+            "transport": self._agent.transport,
+            "psnr_db": info.get("psnr_db"),
+            "pid": os.getpid(),
+        }
 
     def measure(self, calls: int) -> list[float]:
         return timed(lambda: self._obs, self._agent.act, calls)
@@ -131,59 +133,47 @@ class BenchCaller:
 
 
 class LoadGenerator:
-    """Clients of one process that act again at each answer, one thread each."""
+    """Clients of one process that make load: robots, and after them simulations."""
 
-    def __init__(self, url: str, transport: str, codec: str, ranks: Sequence[str]) -> None:
+    def __init__(self, url: str, transport: str, codec: str, robots: int, simulations: int) -> None:
         self._obs = observation()
-        self._ranks = list(ranks)
+        ranks = [ROBOT] * robots + [SIMULATION] * simulations
         self._agents = [connect(url, transport, codec, rank) for rank in ranks]
-        self._pool = ThreadPoolExecutor(max(1, len(ranks)))
-        for ready in [self._pool.submit(agent.reset, self._obs, "measure") for agent in self._agents]:
-            ready.result()
+        with ThreadPoolExecutor(len(ranks)) as pool:
+            list(pool.map(lambda agent: agent.reset(self._obs, "measure"), self._agents))
+        self._loop = ClosedLoop([functools.partial(self._act, agent) for agent in self._agents], robots)
 
     def ready(self) -> bool:
         """Answer an actor's caller once `__init__` is done."""
         return True
 
-    def run(self, active: int, begin: float, end: float) -> list[list[Call]]:
-        """Run the first `active` clients until `end`, s of `time.monotonic`.
-
-        All clients begin at the same moment of the machine's monotonic clock, in every process and actor.
-
-        Returns:
-            For each client its calls that ended after `begin`.
-        """
-        acting = list(zip(self._agents, self._ranks, strict=True))[:active]
-        return [one.result() for one in [self._pool.submit(self._act, *each, begin, end) for each in acting]]
+    def run(self, **wanted: Any) -> list[list[Call]]:
+        """Make calls; see `ClosedLoop.run`."""
+        return self._loop.run(**wanted)
 
     def close(self) -> None:
         for agent in self._agents:
             agent.close()
-        self._pool.shutdown()
+        self._loop.close()
 
-    def _act(self, agent: RemoteAgent, rank: str, begin: float, end: float) -> list[Call]:
-        calls = []
-        think = random.Random(0)
-        while time.monotonic() < end:
-            if rank == ROBOT:
-                time.sleep(think.uniform(0, _THINK_S))
-            timing = agent.act(self._obs).info["timing"]
-            ended = time.monotonic()
-            if begin <= ended < end:
-                calls.append((ended, timing["round_trip_ms"], timing["inference_ms"], int(timing["batch_size"])))
-        return calls
+    def _act(self, agent: RemoteAgent) -> tuple[float, float, int]:
+        timing = agent.act(self._obs).info["timing"]
+        return timing["round_trip_ms"], timing["inference_ms"], int(timing["batch_size"])
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(slots=True)
 class ActorDriver:
     """A client in a Ray actor, as rollouts are."""
 
     actor: Any
+    pid: int = 0  # of the actor's process, once it is ready
+    server_pid: int | None = None
 
     def ready(self) -> dict[str, Any]:
         import ray
 
         said: dict[str, Any] = ray.get(self.actor.ready.remote(), timeout=START_S)
+        self.pid = said["pid"]
         return said
 
     def measure(self, calls: int) -> list[float]:
@@ -194,7 +184,7 @@ class ActorDriver:
 
 
 @contextlib.contextmanager
-def connected(client: OwnClient, url: str, app: str, prefix: Sequence[str] = ()) -> Iterator[Driver]:
+def connected(client: OwnClient, url: str, app: str, prefix: Sequence[str] = ()) -> Iterator[ProcessDriver]:
     """Start a client of ours to the server at `url`; its command begins with `prefix`."""
     if client.actor:
         import ray
@@ -214,11 +204,11 @@ def connected(client: OwnClient, url: str, app: str, prefix: Sequence[str] = ())
 
 
 def main() -> None:
-    """Run the process: the settings are JSON; with "ranks" it makes load."""
+    """Run the process: the settings are JSON; with "robots" it makes load."""
     die_with_parent()
     out = own_stdout()
     settings = json.loads(sys.argv[1])
-    if "ranks" not in settings:
+    if "robots" not in settings:
         caller = BenchCaller(**settings)
         try:
             obey(sys.stdin, out, caller.measure, caller.description)

@@ -1,18 +1,25 @@
-"""Robots that act at their rate and do nothing else: `python -m benchmarks.robots URL`.
+"""Robots that act at their rate and do nothing else: `python -m benchmarks.robots URL [TRANSPORT ROBOTS]`.
 
 Each line that the process reads is a burst, {"robots": 12, "hz": 10, "seconds": 20}. At its end it writes each robot's
-figures.
+figures. With TRANSPORT and ROBOTS, the robots connect at once: the process writes the replica of each, and then each
+line has the arguments of `ConnectedRobots.run`.
 """
 
 from __future__ import annotations
 
+import contextlib
 import json
+import math
+import os
+import random
 import sys
 import time
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
-from typing import NamedTuple
+from functools import partial
+from typing import Any, NamedTuple
 
-from benchmarks.own_clients import observation
+from benchmarks.own_clients import connect, observation
 from vlagents_ray.bench.line_client import die_with_parent, own_stdout
 from vlagents_ray.client.agent import RemoteAgent
 from vlagents_ray.errors import VLAgentsError
@@ -58,14 +65,55 @@ def play(url: str, hz: float, seconds: float) -> RobotBurst:
     return RobotBurst(reset_s, acts, resumed, failed)
 
 
-def main() -> None:
+class ConnectedRobots:
+    """Robots with a session each, which act at their rate."""
+
+    def __init__(self, url: str, transport: str, robots: int) -> None:
+        self._agents = [connect(url, transport, "jpeg", "robot") for _ in range(robots)]
+        # One after another, since a server accepts only so many handshakes at once.
+        self.replicas: list[int] = [agent.reset(observation(), "measure")["pid"] for agent in self._agents]
+        self._threads = ThreadPoolExecutor(robots)
+
+    def run(self, begin: float, end: float, hz: float) -> list[float]:
+        """Act at `hz` between two moments, s of `time.monotonic`; returns the time from tick to action of each act, ms.
+
+        A tick that passes during an act is skipped.
+        """
+
+        def play(agent: RemoteAgent, tick: float) -> list[float]:
+            taken = []
+            while tick < end:
+                time.sleep(max(0.0, tick - time.monotonic()))
+                agent.act(observation())
+                taken.append(time.monotonic() - tick)
+                tick += max(1, math.ceil(taken[-1] * hz)) / hz
+            return taken
+
+        phase = random.Random(os.getpid())  # other moments in each process
+        ticks = [begin + phase.uniform(0, 1 / hz) for _ in self._agents]
+        return [1e3 * taken for played in self._threads.map(play, self._agents, ticks) for taken in played]
+
+    def close(self) -> None:
+        """Close all connections."""
+        for agent in self._agents:
+            agent.close()
+        self._threads.shutdown()
+
+
+def main(url: str, transport: str | None = None, robots: str = "0") -> None:
     """Run the process."""
     die_with_parent()
     out = own_stdout()
-    print(json.dumps("ready"), file=out, flush=True)
-    for line in sys.stdin:
-        print(json.dumps(burst(sys.argv[1], **json.loads(line))), file=out, flush=True)
+    with contextlib.ExitStack() as stack:
+        said: Any = "ready"
+        run: Callable[..., Any] = partial(burst, url)
+        if transport is not None:
+            connected = stack.enter_context(contextlib.closing(ConnectedRobots(url, transport, int(robots))))
+            said, run = connected.replicas, connected.run
+        print(json.dumps(said), file=out, flush=True)
+        for line in sys.stdin:
+            print(json.dumps(run(**json.loads(line))), file=out, flush=True)
 
 
 if __name__ == "__main__":
-    main()
+    main(*sys.argv[1:])

@@ -1,18 +1,22 @@
 """Steps a second of `Rollouts` against a plain loop of the same environments and policy in one process, in turns.
 
 The loop is a learner's first program: it steps environments one after another, calls the policy once for all, and
-collects arrays. `Rollouts` steps as many environments in workers, with a server. With `--torchrl`, TorchRL's collector
-with its inference server also takes its turns.
+collects arrays. `Rollouts` steps as many environments in workers, with a server whose batches may hold all of them. One
+environment is also stepped without workers, in this process. With `--torchrl`, TorchRL's collector with its inference
+server also takes its turns.
 """
 
 from __future__ import annotations
 
 import contextlib
 import itertools
+import math
+import os
 import statistics
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor
+from dataclasses import asdict, dataclass
 from functools import partial
 from multiprocessing import get_context
 from typing import Annotated, Any, ClassVar
@@ -20,9 +24,13 @@ from typing import Annotated, Any, ClassVar
 import numpy as np
 import typer
 
-from vlagents_ray.cli.console import out
+from benchmarks.console import Json, parse_counts, save
+from benchmarks.report import Outcome, show_outcomes
+from vlagents_ray.cli.console import errors, out, progress, table
+from vlagents_ray.cli.options import parse_list
 from vlagents_ray.contract import ActionSpec, Contract
 from vlagents_ray.envs.tabletop import Tabletop
+from vlagents_ray.errors import ConfigError
 from vlagents_ray.interface import Act, Agent, Obs
 from vlagents_ray.learn import RolloutPlan, Rollouts
 from vlagents_ray.registry import policy_class
@@ -33,6 +41,8 @@ _POLICIES: dict[str, tuple[str, dict[str, Any]]] = {
     "tiny": ("benchmarks.rollouts:Tiny", {}),
     "slow": ("noop", {"action_dim": 4, "base_ms": 20, "per_item_ms": 1}),
 }
+LOOP, OURS, LOCAL = "loop", "rollouts", "without Ray"
+_TARGETS = {("tiny", 1): 0.85, ("tiny", 16): 0.9, ("tiny", 64): 0.9}  # of the loop's rate; else 1
 
 
 class Tiny(Agent):
@@ -56,9 +66,10 @@ class Tiny(Agent):
 
 
 def loop(agent: Agent, num_envs: int, episodes: int, options: dict[str, Any], *, images: bool) -> float:
-    """Return the steps a second of `episodes` episodes in this process."""
+    """Return the steps a second of `episodes` episodes in this process, whose arrays are kept until all are played."""
     envs = [Tabletop(**options) for _ in range(num_envs)]
     seeds, steps, begun = itertools.count(), 0, time.perf_counter()
+    collected: list[list[np.ndarray]] = []
     for _ in range(episodes // num_envs):
         seen = [env.reset(seed=next(seeds))[0] for env in envs]
         rows: list[tuple[Any, ...]] = []
@@ -72,21 +83,105 @@ def loop(agent: Agent, num_envs: int, episodes: int, options: dict[str, Any], *,
             ]
             seen = [step[0] for step in done]
             steps += num_envs
-        for column in zip(*rows, strict=True):
-            np.stack(column)
+        collected.append([np.stack(column) for column in zip(*rows, strict=True)])
     return steps / (time.perf_counter() - begun)
+
+
+@dataclass(frozen=True, slots=True)
+class RolloutComparison:
+    """The ways that are measured in turns."""
+
+    policies: tuple[str, ...] = tuple(_POLICIES)
+    envs: tuple[int, ...] = (1, 16, 64)  # in all, of each way
+    workers: int = 2  # at most, for all environments
+    episodes: int = 64  # of each way in each round, rounded up to whole turns of the environments; a quarter if slow
+    rounds: int = 3
+    patience: float = 0.5  # `batch.patience` of the server
+    size: int = 224  # pixels a side
+    images: bool = True  # whether images are kept
+    torchrl: str = ""  # "grouped" in as many workers, "processes", one for each env, or without it
+
+    def __post_init__(self) -> None:
+        if unknown := set(self.policies) - set(_POLICIES):
+            raise ConfigError(f"policies: got {sorted(unknown)}, want some of {list(_POLICIES)}")
+        if odd := [envs for envs in self.envs if envs % min(envs, self.workers)]:
+            raise ConfigError(f"--envs: got {odd}, want multiples of the {self.workers} workers, or 1")
+        if self.torchrl not in ("", "grouped", "processes"):
+            raise ConfigError(f"--torchrl: got {self.torchrl!r}, want 'grouped' or 'processes'")
+
+    @property
+    def options(self) -> dict[str, int]:
+        """The options of each environment."""
+        return {"width": self.size, "height": self.size}
+
+    def turn(self, policy: str, envs: int) -> int:
+        """Return the episodes of a way in a round."""
+        episodes = self.episodes if policy == "tiny" else self.episodes // 4
+        return envs * math.ceil(episodes / envs)
+
+
+def compare_rollouts(plan: RolloutComparison, progress: Callable[[str], None] = lambda _: None) -> dict[str, Any]:
+    """Measure each policy with each number of environments; returns plain JSON values."""
+    rows = [_row(plan, policy, envs, progress) for policy in plan.policies for envs in plan.envs]
+    return {"plan": asdict(plan), "cores": os.cpu_count(), "rows": rows}
+
+
+def _row(plan: RolloutComparison, policy: str, envs: int, progress: Callable[[str], None]) -> dict[str, Any]:
+    name, config = _POLICIES[policy]
+    make = partial(_made, name, config)
+    agent, episodes = make(), plan.turn(policy, envs)
+    agent.initialize()
+    workers = min(envs, plan.workers)
+    settings = {"workers": workers, "num_envs": envs // workers}
+    kept = {"images": plan.images, "env_options": plan.options}
+    ways: dict[str, Callable[[int], float]] = {
+        LOOP: lambda number: loop(agent, envs, number, plan.options, images=plan.images)
+    }
+    if plan.torchrl:
+        ways["torchrl"] = partial(torchrl_rate, plan.torchrl, policy, options=plan.options, **settings)
+    with contextlib.ExitStack() as stack:
+        ways[OURS] = stack.enter_context(served(name, config, plan.patience, **kept, **settings))
+        if envs == 1:
+            ways[LOCAL] = stack.enter_context(collecting(make, **kept, workers=0, num_envs=1))
+        rounds = []
+        for number in range(plan.rounds):
+            rounds.append({way: rate(episodes) for way, rate in ways.items()})
+            text = ", ".join(f"{way} {rate:.0f}" for way, rate in rounds[-1].items())
+            progress(f"{policy}, {envs} envs, round {number + 1}/{plan.rounds}, steps/s: {text}")
+    return {
+        "policy": policy,
+        "envs": envs,
+        "workers": workers,
+        "steps_per_s": {way: statistics.median(one[way] for one in rounds) for way in ways},
+        "of_loop": {way: statistics.median(one[way] / one[LOOP] for one in rounds) for way in ways if way != LOOP},
+        "rounds": rounds,
+    }
+
+
+def _made(name: str, config: Mapping[str, Any]) -> Agent:
+    agent: Agent = policy_class(name).from_config(config)
+    return agent
 
 
 @contextlib.contextmanager
 def served(policy: str, config: dict[str, Any], patience: float, **settings: Any) -> Iterator[Callable[[int], float]]:
-    """Yield a function that returns the steps a second of n episodes of `Rollouts` with these settings."""
-    document = deployment(policy, config=config, batch={"patience": patience})
-    app = document.applications[0].name
+    """Serve the policy, and yield `collecting` with its server."""
+    rows = settings["workers"] * settings["num_envs"]
+    document = deployment(policy, config=config, batch={"patience": patience, "max_size": rows})
     with (
-        running_server(document, num_cpus=settings["workers"] + 2, ingress=False),
-        Rollouts(RolloutPlan("tabletop", f"serve://{app}", **settings)) as rollouts,
+        running_server(document, num_cpus=settings["workers"] + 3, ingress=False),
+        collecting(f"serve://{document.applications[0].name}", **settings) as measure,
     ):
-        rollouts.collect(4 * settings["workers"] * settings["num_envs"])  # workers start, and make their environments
+        yield measure
+
+
+@contextlib.contextmanager
+def collecting(policy: str | Callable[[], Agent], **settings: Any) -> Iterator[Callable[[int], float]]:
+    """Yield a function that returns the steps a second of n episodes of `Rollouts` with these settings."""
+    with Rollouts(RolloutPlan("tabletop", policy, **settings)) as rollouts:
+        rollouts.collect(
+            4 * max(1, settings["workers"]) * settings["num_envs"]
+        )  # workers start, and make their environments
 
         def measure(episodes: int) -> float:
             begun = time.perf_counter()
@@ -109,46 +204,61 @@ def torchrl_rate(layout: str, policy: str, episodes: int, **settings: Any) -> fl
         return process.submit(rate, name, config, episodes=episodes, **settings).result()
 
 
+def rollout_outcomes(found: Mapping[str, Any]) -> list[Outcome]:
+    """Return the targets: of a tiny policy a share of the loop's rate, of a slow one all of it.
+
+    One environment is judged by its rate without Ray, which is how to play it.
+    """
+    outcomes = []
+    for row in found["rows"]:
+        way = LOCAL if LOCAL in row["of_loop"] else OURS
+        wanted, got = _TARGETS.get((row["policy"], row["envs"]), 1.0), row["of_loop"][way]
+        who = "rollouts" if way == OURS else "rollouts without Ray"
+        name = f"{who}, {row['envs']} environments, the {row['policy']} policy"
+        outcomes.append(Outcome(name, f"≥ {wanted:g} x a loop in one process", f"{got:.2f}", got >= wanted))
+    return outcomes
+
+
+def show_rollouts(found: Mapping[str, Any]) -> None:
+    """Print a row for each policy and number of environments, and the targets."""
+    plan = found["plan"]
+    ways = list(dict.fromkeys(way for row in found["rows"] for way in row["steps_per_s"]))
+    rows = table(
+        "policy", "envs", "workers", *(f"{way}, steps/s" for way in ways), *(f"{way} / loop" for way in ways[1:])
+    )
+    rows.title = f"{plan['size']}x{plan['size']}, medians of {plan['rounds']} rounds on {found['cores']} cores"
+    for row in found["rows"]:
+        rates = (f"{row['steps_per_s'][way]:.0f}" if way in row["steps_per_s"] else "" for way in ways)
+        shares = (f"{row['of_loop'][way]:.2f}" if way in row["of_loop"] else "" for way in ways[1:])
+        rows.add_row(row["policy"], str(row["envs"]), str(row["workers"]), *rates, *shares)
+    out.print(rows)
+    show_outcomes(rollout_outcomes(found))
+
+
 def main(
-    policy: Annotated[str, typer.Argument(help=f"one of {', '.join(_POLICIES)}")] = "tiny",
-    workers: Annotated[int, typer.Option(help="Workers of the rollouts.")] = 2,
-    num_envs: Annotated[int, typer.Option(help="Environments of each worker.")] = 8,
-    episodes: Annotated[int, typer.Option(help="Episodes of each way in each round.")] = 64,
-    rounds: Annotated[int, typer.Option(help="Rounds.")] = 3,
+    policies: Annotated[str, typer.Option(help=f"Some of {', '.join(_POLICIES)}.")] = ",".join(_POLICIES),
+    envs: Annotated[str, typer.Option(help="Numbers of environments.")] = "1,16,64",
+    workers: Annotated[int, typer.Option(min=1, help="Workers of the rollouts, at most.")] = 2,
+    episodes: Annotated[int, typer.Option(min=4, help="Of each way in each round; a quarter if slow.")] = 64,
+    rounds: Annotated[int, typer.Option(min=1)] = 3,
     patience: Annotated[float, typer.Option(help="`batch.patience` of the server.")] = 0.5,
     size: Annotated[int, typer.Option(help="Pixels a side.")] = 224,
     images: Annotated[bool, typer.Option(help="Whether images are kept.")] = True,
     torchrl: Annotated[
         str,
-        typer.Option(help="TorchRL's collector, too: 'grouped' in as many workers, or 'processes', one for each env."),
+        typer.Option(help="TorchRL's collector too: 'grouped' in as many workers, or 'processes', one for each env."),
     ] = "",
+    json_file: Json = None,
 ) -> None:
-    """Measure steps a second of each variant, and the ratios in each round."""
-    if torchrl not in ("", "grouped", "processes"):
-        raise typer.BadParameter(f"--torchrl: got {torchrl!r}, want 'grouped' or 'processes'")
-    name, config = _POLICIES[policy]
-    options = {"width": size, "height": size}
-    agent = policy_class(name).from_config(config)
-    agent.initialize()
-    ratios: dict[str, list[float]] = {}
-
-    def plain(episodes: int) -> float:
-        return loop(agent, workers * num_envs, episodes, options, images=images)
-
-    with contextlib.ExitStack() as stack:
-        settings = {"workers": workers, "num_envs": num_envs}
-        ways: dict[str, Callable[[int], float]] = {"loop": plain}
-        if torchrl:
-            ways["torchrl"] = partial(torchrl_rate, torchrl, policy, options=options, **settings)
-        measure = stack.enter_context(served(name, config, patience, images=images, env_options=options, **settings))
-        for _ in range(rounds):
-            rates = {way: rate(episodes) for way, rate in ways.items()}
-            ours = measure(episodes)
-            for way, rate in rates.items():
-                ratios.setdefault(way, []).append(ours / rate)
-                out.print(f"{way} {rate:.0f} steps/s, rollouts {ours:.0f} steps/s: {ratios[way][-1]:.2f}")
-    for way, found in ratios.items():
-        out.print(f"median against {way} {statistics.median(found):.2f}")
+    """Measure steps a second of each way, and their shares of the loop's."""
+    with errors():
+        plan = RolloutComparison(
+            tuple(parse_list(policies)), tuple(parse_counts(envs, "--envs")), workers, episodes, rounds, patience, size,
+            images, torchrl,
+        )  # fmt: skip
+        found = compare_rollouts(plan, progress)
+    show_rollouts(found)
+    save(found, json_file)
 
 
 if __name__ == "__main__":

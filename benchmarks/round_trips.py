@@ -3,12 +3,14 @@
 The observation is that of the paper's measurement: two 224x224 RGB cameras and seven joints. All clients take turns in
 short rounds, in a new random order each time, so that other load on the machine affects them alike. Every client is a
 process (those that need Ray, an actor); every server stays up, and idles between its turns. So each turn begins cold,
-which the 99th percentile shows; at the end the clients on the node also make calls without a break.
+which the 99th percentile shows; at the end the clients on the node also make calls without a break. CPU time and
+context switches of client and server are counted around each turn.
 """
 
 from __future__ import annotations
 
 import contextlib
+import os
 import random
 import tempfile
 from collections.abc import Callable, Mapping, Sequence
@@ -19,9 +21,10 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks.drivers import Driver
+from benchmarks.drivers import Driver, ProcessDriver
 from benchmarks.figures import RoundTrips, lost_db, ratios
 from benchmarks.own_clients import OwnClient, connected, observation, save_observation
+from benchmarks.processes import UsageMeter, count_idle, server_processes
 from vlagents_ray.errors import ConfigError
 from vlagents_ray.interface import Obs
 from vlagents_ray.policies.noop import Noop
@@ -34,7 +37,7 @@ ROUND = 100  # calls of one client in its turn
 UNBROKEN = 200  # rounds' worth of calls without a break: a second or two
 ON_NODE = ("shm", "plasma")
 
-StartClient = Callable[[Path], AbstractContextManager[Driver]]  # given the file of the observation
+StartClient = Callable[[Path], AbstractContextManager[ProcessDriver]]  # given the file of the observation
 
 
 class MeasuredNoop(Noop):
@@ -56,6 +59,7 @@ class RoundTripsOfAll:
     skipped: Mapping[str, str] = field(default_factory=dict)
     steady: tuple[RoundTrips, ...] = ()  # of clients on the node, each without a break
     psnr_db: Mapping[str, float | None] = field(default_factory=dict)  # of the images, by client; None: lossless
+    use: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)  # of an act: `MeteredDriver.per_act`, by client
 
     def to_json(self) -> dict[str, Any]:
         return {
@@ -63,8 +67,51 @@ class RoundTripsOfAll:
             "peers": [trips.to_json() for trips in self.theirs],
             "ratios": ratios(self.ours, self.theirs),
             "steady": [trips.to_json() for trips in self.steady],
+            "use": dict(self.use),
             "skipped": dict(self.skipped),
         }
+
+
+class MeteredDriver:
+    """A driver that also counts what an act uses of the machine: CPU time and context switches.
+
+    Args:
+        driver: A driver that is ready.
+        server: The processes of its server.
+    """
+
+    def __init__(self, driver: ProcessDriver, server: Sequence[int]) -> None:
+        self._driver, self._acts = driver, 0
+        self.client, self.server = UsageMeter([driver.pid]), UsageMeter(server)
+
+    def ready(self) -> dict[str, Any]:
+        """Return nothing: the driver is ready."""
+        return {}
+
+    def measure(self, calls: int) -> list[float]:
+        """Make calls; returns their durations, ms."""
+        with self.server.counting(), self.client.counting():
+            taken = self._driver.measure(calls)
+        self._acts += calls
+        return taken
+
+    def per_act(self) -> dict[str, Any]:
+        """Return the use of client and server for each act so far, as `UsageMeter.per_act` does."""
+        return {"client": self.client.per_act(self._acts), "server": self.server.per_act(self._acts)}
+
+
+def metered(drivers: Mapping[str, ProcessDriver]) -> dict[str, MeteredDriver]:
+    """Count what the acts of ready drivers use beyond the use of the same processes while all are idle."""
+    others = [pid for one in drivers.values() for pid in (one.pid, one.server_pid) if pid is not None]
+    ours = server_processes(os.getpid(), others)
+    found = {}
+    for name, one in drivers.items():
+        server = ours
+        if one.server_pid is not None:
+            server = sorted({one.server_pid, *server_processes(one.server_pid)} - {one.pid})
+        found[name] = MeteredDriver(one, server)
+    count_idle([meter for one in found.values() for meter in (one.client, one.server)])
+    return found
 
 
 def measure(
@@ -79,7 +126,7 @@ def measure(
 ) -> RoundTripsOfAll:
     """Measure our clients, and others by name with their own servers, in turns."""
     others = others or {}
-    drivers: dict[str, Driver] = {}
+    drivers: dict[str, ProcessDriver] = {}
     with contextlib.ExitStack() as stack:
         obs = Path(stack.enter_context(tempfile.TemporaryDirectory())) / "observation.npz"
         save_observation(observation(), obs)
@@ -93,7 +140,9 @@ def measure(
         if not drivers:
             raise ConfigError("nothing to measure: want a transport or another server")
         said = {name: driver.ready() for name, driver in drivers.items()}
-        found = in_turns(drivers, calls, progress)
+        meters = metered(drivers)
+        found = in_turns(meters, calls, progress)
+        use = {name: one.per_act() for name, one in meters.items()}
         steady = [
             RoundTrips(one.name, np.array([drivers[one.name].measure(UNBROKEN * min(ROUND, calls))]))
             for one in own
@@ -105,6 +154,7 @@ def measure(
         skipped or {},
         tuple(steady),
         {one.name: said[one.name]["psnr_db"] for one in own},
+        use,
     )
 
 

@@ -1,4 +1,4 @@
-"""Round trips of one `act`: every transport of ours, and other policy servers (`peers`), in turns in one run."""
+"""Round trips and CPU time of one `act`: our transports, and other policy servers (`peers`), in turns in one run."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import Any
 import typer
 
 from benchmarks import peers as others
-from benchmarks.console import Calls, Json, Transports, save, show_round_trips
+from benchmarks.console import Calls, Json, Transports, save, show_round_trips, show_use
 from benchmarks.figures import measured_on
 from benchmarks.own_clients import own_clients
 from benchmarks.round_trips import measure
@@ -50,7 +50,7 @@ def main(
     peers_python: others.PeersPython = others.PYTHON,
     json_file: Json = None,
 ) -> None:
-    """Measure round trips to a `noop` policy on this machine: every transport, and other policy servers, in turns."""
+    """Measure round trips and CPU time of acts on this machine: every transport, and other policy servers, in turns."""
     with errors():
         origin = measured_on("python -m benchmarks.rtt")
         found = measure_with_peers(
@@ -58,6 +58,7 @@ def main(
             progress=progress,
         )  # fmt: skip
         show_round_trips(found, "round trip of one act on this machine")
+        show_use(found)
         save({**origin, **found, "versions": origin["versions"] | found["versions"]}, json_file)
 
 

@@ -3,8 +3,9 @@
 Environment and policy sleep, so that many workers run on few cores and only the overhead is measured. On clusters of
 one to three hosts (`benchmarks.hosts`), or on a running one, evaluations with increasing numbers of workers take turns
 with one of a single worker; the rate is that while all were playing, so that their start does not count. Every node has
-a replica for each of its workers, so that none waits for another's batch. On the first cluster, all workers also share
-one replica a node, with single actions and with chunks.
+a replica for each of its workers, so that none waits for another's batch. Links between the hosts have the given rate
+and delay, and the bytes that hosts send are counted, from the begin of an evaluation to its end. On the first cluster,
+all workers also share one replica a node, with single actions and with chunks.
 
 The driver is measured by short evaluations with steps, episodes and workers in different proportions. Its CPU time is
 fitted by the costs of an episode, a step, and a second of a busy worker.
@@ -13,6 +14,7 @@ fitted by the costs of an episode, a step, and a second of a busy worker.
 from __future__ import annotations
 
 import contextlib
+import itertools
 import json
 import math
 import os
@@ -26,7 +28,9 @@ import numpy as np
 import typer
 
 from benchmarks.console import Json, parse_counts, save
-from benchmarks.hosts import hosts, ray_cluster
+from benchmarks.far_carrier import Conditions
+from benchmarks.far_link import FarLink
+from benchmarks.hosts import Host, hosts, ray_cluster
 from benchmarks.scaling_driver import Fleet, PlayedEpisodes, ScalingRound
 from vlagents_ray.bench.line_process import LineProcess, our_environment
 from vlagents_ray.cli.console import errors, out, progress, table
@@ -34,6 +38,7 @@ from vlagents_ray.errors import ConfigError
 
 OWN, SHARED, CHUNKS = "own", "shared", "chunks"  # applications: a replica a worker; one a node, acts and chunks
 CHUNK = 8  # rows
+IMAGE_BYTES = 224 * 224 * 3  # of each act's observation
 _START_S = 300.0
 _PLAY_S = 600.0
 _LATE_S = 1.0  # longest delay between the starts of two workers
@@ -53,6 +58,8 @@ class ScalingPlan:
     policy_ms: float = 50.0
     steps: int = 50  # of an episode
     seconds: float = 8.0  # in which all workers play together, about
+    mbit: float = 1000.0  # Mbit/s of a link between two hosts, each way
+    delay_ms: float = 5.0  # of such a link, each way
 
     def __post_init__(self) -> None:
         if self.workers[0] != 1 or list(self.workers) != sorted(set(self.workers)):
@@ -83,8 +90,8 @@ def measure_scaling(
     found: dict[str, Any] = {"plan": asdict(plan), "cores": os.cpu_count(), "clusters": []}
     clusters = (0,) if address else plan.nodes  # 0: all nodes
     for nodes in clusters:
-        with driving(plan, nodes, address) as (driver, size):
-            found["clusters"].append(measure_cluster(plan, size, driver, progress, shared=nodes == clusters[0]))
+        with driving(plan, nodes, address) as (driver, size, made):
+            found["clusters"].append(measure_cluster(plan, size, driver, progress, made, shared=nodes == clusters[0]))
             if nodes == clusters[-1]:
                 progress("the driver's costs")
                 found["driver"] = _driver_costs(plan, driver)
@@ -92,8 +99,10 @@ def measure_scaling(
 
 
 @contextlib.contextmanager
-def driving(plan: ScalingPlan, nodes: int, address: str | None = None) -> Iterator[tuple[LineProcess, int]]:
-    """Start a driver and its policies on `nodes` hosts or at `address`; yields it and the number of nodes."""
+def driving(
+    plan: ScalingPlan, nodes: int, address: str | None = None
+) -> Iterator[tuple[LineProcess, int, Sequence[Host]]]:
+    """Start a driver and its policies on `nodes` hosts or at `address`; yields it, the nodes' number, and the hosts."""
     size = max(1, nodes)
     slots = math.ceil(plan.most / size)
     pinned = address is None
@@ -104,9 +113,14 @@ def driving(plan: ScalingPlan, nodes: int, address: str | None = None) -> Iterat
     }
     with contextlib.ExitStack() as stack:
         start: Callable[[list[str]], list[str]] = list
+        made: Sequence[Host] = ()
         if address is None:
             resources = json.dumps({OWN: slots, SHARED: 1, CHUNKS: 1})  # for replicas, on each node
             made = stack.enter_context(hosts(nodes))
+            for one, other in itertools.combinations(made, 2):
+                device = f"far{one.number}{other.number}"
+                link = stack.enter_context(FarLink(one, other, device=device, own=True))
+                link.set(Conditions(plan.delay_ms, mbit=plan.mbit))
             # Ray's workers would wait for other processes here; our own server sets the same.
             environment = our_environment() | {"RAY_worker_niceness": "0"}
             cluster = stack.enter_context(ray_cluster(made, slots, environment, resources=resources))
@@ -118,7 +132,7 @@ def driving(plan: ScalingPlan, nodes: int, address: str | None = None) -> Iterat
         }
         command = start([sys.executable, "-m", "benchmarks.scaling_driver", json.dumps(settings)])
         child = stack.enter_context(LineProcess("driver", command, our_environment(), end_s=60.0))
-        yield child, child.read(_START_S)["nodes"]
+        yield child, child.read(_START_S)["nodes"], made
 
 
 def measure_cluster(
@@ -126,10 +140,14 @@ def measure_cluster(
     nodes: int,
     driver: LineProcess,
     progress: Callable[[str], None] = lambda _: None,
+    made: Sequence[Host] = (),
     *,
     shared: bool = False,
 ) -> dict[str, Any]:
-    """Measure rates by number of workers, in rounds that play each once; `shared` adds workers that share a replica."""
+    """Measure rates by number of workers, in rounds that play each once; `shared` adds workers that share a replica.
+
+    `made` are the hosts whose traffic is counted.
+    """
     counts = [workers for workers in plan.workers if workers == 1 or workers >= nodes]
     kinds = [(OWN, workers) for workers in counts]
     if shared:
@@ -137,7 +155,10 @@ def measure_cluster(
     played: dict[tuple[str, int], list[PlayedEpisodes]] = {kind: [] for kind in kinds}
     for number in range(plan.rounds):
         for app, workers in kinds:
+            before = sum(host.sent_bytes() for host in made)
             one = _play(driver, plan.round(workers, app))
+            if made:
+                one = one._replace(sent_bytes=sum(host.sent_bytes() for host in made) - before)
             played[app, workers].append(one)
             progress(
                 f"{nodes} nodes, round {number + 1}/{plan.rounds}: {workers} workers ({app}), "
@@ -156,6 +177,7 @@ def row(
     the sleeps alone allow.
     """
     rates = [one.rate for one in played]
+    sent = [one.sent_bytes / one.acts for one in played if one.sent_bytes is not None]
     linear = [workers * each for each in single] if app != CHUNKS else [plan.ideal(workers, app)] * len(rates)
     return {
         "app": app,
@@ -166,6 +188,8 @@ def row(
         "wall_s": statistics.median(one.wall_s for one in played),
         "failures": sum(one.failures for one in played),
         "transports": sorted({way for one in played for way in one.transports}),
+        "near": min(one.near for one in played),
+        "sent_bytes_per_act": statistics.median(sent) if sent else None,
         "driver_share": statistics.median(one.driver_s / one.span_s for one in played),
         "daemon_shares": {
             name: statistics.median(one.daemons_s[name] / one.span_s for one in played) for name in played[0].daemons_s
@@ -234,16 +258,29 @@ def saturation(costs_ms: Mapping[str, float], episode_s: float, steps: int) -> f
 def show_scaling(found: Mapping[str, Any]) -> None:
     """Print a row for each number of workers on each cluster."""
     plan = found["plan"]
-    rows = table("nodes", "workers", "replicas", "episodes/min", "of linear", "of ideal", "whole run s", "by")
+    rows = table(
+        "nodes",
+        "workers",
+        "replicas",
+        "episodes/min",
+        "of linear",
+        "of ideal",
+        "whole run s",
+        "by",
+        "near",
+        "bytes sent an act",
+    )
     rows.title = (
         f"{plan['steps']} steps of {plan['step_ms']:g} ms, policy {plan['policy_ms']:g} ms, "
-        f"medians of {plan['rounds']} rounds on {found['cores']} cores"
+        f"medians of {plan['rounds']} rounds on {found['cores']} cores, links of {plan['mbit']:g} Mbit/s and "
+        f"{plan['delay_ms']:g} ms; near: workers on a replica's node; an act's image has {IMAGE_BYTES} bytes"
     )
     for cluster in found["clusters"]:
         for row in cluster["rows"]:
             counts = (str(cluster["nodes"]), str(row["workers"]), row["app"], f"{row['episodes_per_minute']:.1f}")
             ratios = (f"{row['of_linear']:.3f}", f"{row['of_ideal']:.3f}", f"{row['wall_s']:.1f}")
-            rows.add_row(*counts, *ratios, ", ".join(row["transports"]))
+            sent = "" if row["sent_bytes_per_act"] is None else f"{row['sent_bytes_per_act']:.0f}"
+            rows.add_row(*counts, *ratios, ", ".join(row["transports"]), f"{row['near']:.0%}", sent)
         rows.add_section()
     out.print(rows)
 
@@ -270,6 +307,8 @@ def main(
     step_ms: Annotated[float, typer.Option(min=0, help="Each step of the environment sleeps so long.")] = 20.0,
     policy_ms: Annotated[float, typer.Option(min=0, help="And each batch of the policy.")] = 50.0,
     seconds: Annotated[float, typer.Option(min=0.1, help="That all workers play together, about.")] = 8.0,
+    mbit: Annotated[float, typer.Option(min=1, help="Mbit/s of a link between two hosts that are made.")] = 1000.0,
+    delay_ms: Annotated[float, typer.Option(min=0, help="Of such a link, each way.")] = 5.0,
     address: Annotated[
         str | None, typer.Option(help="A running Ray cluster in place of those hosts; they want root.")
     ] = None,
@@ -279,7 +318,7 @@ def main(
     with errors():
         plan = ScalingPlan(
             workers=tuple(parse_counts(workers, "--workers")), nodes=tuple(parse_counts(nodes, "--nodes")),
-            rounds=rounds, step_ms=step_ms, policy_ms=policy_ms, seconds=seconds,
+            rounds=rounds, step_ms=step_ms, policy_ms=policy_ms, seconds=seconds, mbit=mbit, delay_ms=delay_ms,
         )  # fmt: skip
         found = measure_scaling(plan, address, progress)
     show_scaling(found)

@@ -19,16 +19,18 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from benchmarks.environments import ACTION_DIM, SLEEPING_ENV
-from benchmarks.overhead import cpu_seconds, recorded, steady
+from benchmarks.overhead import recorded, steady
+from benchmarks.processes import cpu_seconds, program
 from vlagents_ray.bench.line_client import die_with_parent, own_stdout
-from vlagents_ray.evaluate import EvalConfig, PolicyConfig, Progress, SuiteConfig, WorkerConfig, evaluate
+from vlagents_ray.evaluate import EvalConfig, PolicyConfig, Progress, Results, SuiteConfig, WorkerConfig, evaluate
 from vlagents_ray.evaluate.episode.records import EpisodeResult
 from vlagents_ray.evaluate.plan.cases import EvalCase
 from vlagents_ray.policies.noop import Noop, NoopConfig
 from vlagents_ray.serve.launch.deployment_file import deployment, together
 from vlagents_ray.serve.launch.server import running_server
 
-DAEMONS = ("gcs_server", "raylet", "ServeController")  # of this node, by words of their command line
+NEAR = ("shm", "plasma", "local")  # transports within a node
+DAEMONS = ("gcs_server", "raylet", "ServeController")  # of this node
 
 
 @dataclass(frozen=True, slots=True)
@@ -73,6 +75,9 @@ class PlayedEpisodes(NamedTuple):
     busy_s: float  # that workers were playing, added up
     driver_s: float  # CPU time of this process
     daemons_s: dict[str, float]  # and of Ray's on this node
+    near: float = 1.0  # share of the workers whose observations do not leave their node
+    acts: int = 1  # of all recorded episodes
+    sent_bytes: int | None = None  # by all hosts to others, start of the workers included; None: not counted
 
     @property
     def rate(self) -> float:
@@ -118,6 +123,9 @@ def play(one: ScalingRound, out: Path) -> PlayedEpisodes:
     wall_s, last = time.monotonic() - begun, daemons_s()
     played = recorded(out)
     first = min(each.ended for each in played)
+    results = Results.load(out)
+    near = [worker.transport in NEAR for worker in results.workers]
+    acts = sum(episode.result.acts for cell in results.cells for episode in cell.episodes)
     return PlayedEpisodes(
         None if one.app is None else 60 * steady(played, one.workers).rate / one.steps,
         wall_s,
@@ -128,20 +136,18 @@ def play(one: ScalingRound, out: Path) -> PlayedEpisodes:
         sum(each.ended - max(first, each.begun) for each in played),
         ledger.cpu_s[-1] - ledger.cpu_s[0],
         {name: used - ledger.first.get(name, 0.0) for name, used in last.items()},
+        sum(near) / len(near),
+        acts,
     )
 
 
 def daemons_s() -> dict[str, float]:
     """Return the CPU time that Ray's own processes of this node have used so far, s."""
     found = dict.fromkeys(DAEMONS, 0.0)
-    for entry in Path("/proc").iterdir():
-        if not entry.name.isdigit():
-            continue
+    for entry in Path("/proc").glob("[0-9]*"):
         with contextlib.suppress(OSError):  # it has ended
-            program = (entry / "cmdline").read_bytes().partition(b"\0")[0].decode(errors="replace")
-            for name in DAEMONS:
-                if Path(program).name.removeprefix("ray::").startswith(name):
-                    found[name] += cpu_seconds(int(entry.name))
+            if (name := program(pid := int(entry.name))) in found:
+                found[name] += cpu_seconds(pid)
     return found
 
 

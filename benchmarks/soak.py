@@ -25,7 +25,7 @@ import numpy as np
 import typer
 
 from benchmarks.console import Json, save
-from benchmarks.environments import TIMED_TABLETOP, EpisodeTimes, read_episode_times
+from benchmarks.environments import TIMED_ENV, EpisodeTimes, read_episode_times
 from benchmarks.report import Outcome, show_outcomes, unmeasured
 from vlagents_ray.cli.console import errors, out, progress
 from vlagents_ray.evaluate import EvalConfig, PolicyConfig, Progress, Results, SuiteConfig, evaluate
@@ -82,7 +82,7 @@ def measure_soak(soak: SoakPlan, progress: Callable[[str], None] = lambda _: Non
             policies=[PolicyConfig(name="noop", url="serve://noop")],
             suites=[
                 SuiteConfig(
-                    envs=[TIMED_TABLETOP],
+                    envs=[TIMED_ENV],
                     env_options={"notes": str(notes), "size": soak.size, "max_steps": soak.max_steps},
                     episodes=soak.episodes,
                 )

@@ -174,8 +174,8 @@ class Players:
         options: dict[str, Any] = {"adapter": "own"} if way.adapter else {}
         policy = PolicyConfig(name=way.name, config=way.config, options=options, execute=way.execute)
         place = self._folder / plain(way.name)
-        plan = EvalConfig(policies=[policy], suites=[suite], out=place, video="none", resume=True)
-        evaluate(plan, agent_factory=lambda: self._agent(way), in_process=True)
+        plan = EvalConfig(policies=[policy], suites=[suite], out=place, video="none", workers=0, resume=True)
+        evaluate(plan, agent_factory=lambda: self._agent(way))
         counted = [one for cell in Results.load(place).cells for one in cell.counted]
         found = {one.key.seed: (bool(one.success_once), str(one.actions_sha256)) for one in counted}
         return Played(way, found, float(np.median([one.policy_ms for one in counted if one.policy_ms])))

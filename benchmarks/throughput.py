@@ -2,27 +2,35 @@
 
 The default policy takes 20 ms for a batch and 1 ms for each observation in it, without using the CPU: with 16 in a
 batch, 444 actions a second are the ideal. Any other policy is measured bare in the same run. All transports take turns.
-A robot among simulations, which acts at random moments, is also measured.
+A robot among simulations, which acts at random moments, is also measured. So are other policy servers, which compute
+the same policy, also in batches of at most 16 if they can.
 """
 
 from __future__ import annotations
 
 import contextlib
 import json
+import random
+import signal
 import statistics
 import sys
+import tempfile
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import AbstractContextManager
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Annotated, Any
 
 import numpy as np
 import typer
 
+from benchmarks import peers as others
+from benchmarks.closed_loop import Call
 from benchmarks.console import Json, Rounds, Seconds, parse_counts, save, show_skipped
 from benchmarks.drivers import START_S
-from benchmarks.figures import measured_on
-from benchmarks.own_clients import ROBOT, SIMULATION, Call, LoadGenerator, OwnClient, own_clients
+from benchmarks.figures import mean_interval, measured_on, median_interval
+from benchmarks.own_clients import LoadGenerator, OwnClient, observation, own_clients, save_observation
 from vlagents_ray.bench.line_process import LineProcess, our_environment
 from vlagents_ray.bench.measured_policy import rate_of
 from vlagents_ray.cli.console import errors, out, progress, table
@@ -34,6 +42,7 @@ from vlagents_ray.serve.launch.server import running_server
 DEFAULT_TRANSPORTS = ("plasma", "handle", "shm", "websocket")
 BASE_MS, PER_ITEM_MS = 20.0, 1.0
 SLOW_NOOP = ("noop", {"base_ms": BASE_MS, "per_item_ms": PER_ITEM_MS})
+WITHOUT_GAIN = {"base_ms": 0.0, "per_item_ms": 5.0}  # a policy for which a batch is no faster
 _PROCESSES = 4  # shared by the clients, besides the robot's
 _WARM_S = 0.5
 _LATE_S = 60.0
@@ -53,6 +62,8 @@ class ThroughputPlan:
     rounds: int = 3
     robot_seconds: float = 10.0
     transports: Sequence[str] = DEFAULT_TRANSPORTS
+    peers: Sequence[str] = ()  # names of `peers.PEERS`, or "all"; they need the policy `noop`
+    peers_python: Path = others.PYTHON
 
     @property
     def ideal(self) -> Callable[[int], float] | None:
@@ -67,54 +78,61 @@ class ThroughputPlan:
 
 
 def measure_throughput(plan: ThroughputPlan, progress: Callable[[str], None] = lambda _: None) -> dict[str, Any]:
-    """Measure the plan; returns plain JSON values."""
+    """Measure the plan, all fleets in turns, in a new random order in each round; returns plain JSON values."""
     found, skipped = own_clients(plan.transports)
     chosen = _one_each(found)
+    theirs, absent, versions = others.peer_clients(plan.peers, plan.peers_python)
+    skipped |= absent | {one.name: "its server has one client" for one in theirs if not one.several}
     served = deployment(
         plan.policy, config=dict(plan.config), batch={"max_size": plan.batch}, resources={"num_gpus": plan.num_gpus}
     )
+    most = max(plan.clients)
     with contextlib.ExitStack() as stack:
         bare = None if plan.ideal else stack.enter_context(_bare(plan))
         server = stack.enter_context(running_server(served))
         (app,) = server.apps
-        fleets = {one.transport: stack.enter_context(_fleet(one, server.url, app, max(plan.clients))) for one in chosen}
-        rates: dict[str, list[float]] = {name: [] for name in fleets}
+        ours = {one.transport: stack.enter_context(_fleet(one, server.url, app, most)) for one in chosen}
+        obs = Path(stack.enter_context(tempfile.TemporaryDirectory())) / "observation.npz"
+        save_observation(observation(), obs)
+        running: dict[str, others.PeerServer] = {}
+        peers = {one.name: stack.enter_context(peer_fleet(one, plan, obs, running)) for one in theirs if one.several}
+        fleets = ours | peers
+        turns: dict[str, _Turns] = {name: _Turns({k: [] for k in plan.clients}, []) for name in fleets}
         bare_rates = []
+        order = list(fleets)
         for number in range(plan.rounds):
             if bare is not None:
                 bare_rates.append(float(bare.request(str(plan.seconds), plan.seconds + START_S)))
-            for name, fleet in fleets.items():
-                rates[name].append(rate_of(fleet.run(max(plan.clients), plan.seconds)))
-            progress(
-                f"round {number + 1} of {plan.rounds}: {', '.join(f'{n} {r[-1]:.0f}/s' for n, r in rates.items())}"
-            )
-        best = plan.ideal(max(plan.clients)) if plan.ideal else statistics.median(bare_rates)
-        rows = {}
-        for name, fleet in fleets.items():
-            curve = [_point(plan, fleet, k) for k in plan.clients]
-            progress(f"{name}: clients from {min(plan.clients)} to {max(plan.clients)}")
-            robot = _waiting(fleet.robot_run(max(plan.clients), plan.robot_seconds)) if plan.robot_seconds else None
-            if robot is not None:
-                progress(f"{name}: a robot among simulations waits {robot['wait_p50_ms']:.1f} ms")
-            median = statistics.median(rates[name])
-            rows[name] = {
-                "actions_per_s": median,
-                "rounds": rates[name],
-                "of_ideal": median / best,
-                "curve": curve,
-                "robot": robot,
-            }
+            random.Random(number).shuffle(order)
+            for k in plan.clients:
+                for name in order:
+                    turns[name].calls[k].append(fleets[name].run(0, k, plan.seconds))
+                progress(f"round {number + 1} of {plan.rounds}: {k} clients of each")
+            for name in order if plan.robot_seconds else ():
+                among = fleets[name].run(1, most - 1, plan.robot_seconds / plan.rounds)
+                turns[name].robot.extend(among[0])
+    best = plan.ideal(most) if plan.ideal else statistics.median(bare_rates)
     return {
         "policy": plan.policy,
         "config": dict(plan.config),
         "batch": plan.batch,
-        "clients": max(plan.clients),
+        "clients": most,
         "ideal_actions_per_s": best,
         "ideal_is": "bare, measured in the same run" if bare_rates else "by arithmetic",
         "bare_rounds": bare_rates,
-        "transports": rows,
+        "transports": {one.transport: {"way": one.name, **_row(plan, turns[one.transport], best)} for one in chosen},
+        "peers": {name: _row(plan, turns[name], best) for name in peers},
         "skipped": skipped,
+        "versions": versions,
     }
+
+
+@dataclass(frozen=True, slots=True)
+class _Turns:
+    """The calls of a fleet."""
+
+    calls: dict[int, list[list[list[Call]]]]  # by number of clients, round and client
+    robot: list[Call]
 
 
 @dataclass(frozen=True, slots=True)
@@ -126,56 +144,80 @@ class _Part:
 
 
 @dataclass(frozen=True, slots=True)
-class _Fleet:
-    """All clients of one transport: one robot in one part, simulations in the others."""
+class Fleet:
+    """All clients of one transport or peer: one robot in the first part, simulations in the others, if any."""
 
-    _parts: Sequence[_Part]
-    _robot: _Part
+    parts: Sequence[_Part]
+    turn: Callable[[], AbstractContextManager[None]] = contextlib.nullcontext
 
-    def run(self, clients: int, seconds: float) -> list[list[Call]]:
-        """Run `clients` simulations for `seconds`, spread over the parts; returns their calls."""
-        return self._together(self._spread(clients), seconds)
-
-    def robot_run(self, clients: int, seconds: float) -> list[Call]:
-        """Run a robot among `clients` - 1 simulations; returns its calls."""
-        return self._together([(self._robot, 1), *self._spread(clients - 1)], seconds)[0]
-
-    def _spread(self, clients: int) -> list[tuple[_Part, int]]:
-        return list(zip(self._parts, _shares(clients, len(self._parts)), strict=True))
-
-    @staticmethod
-    def _together(shares: Sequence[tuple[_Part, int]], seconds: float) -> list[list[Call]]:
-        begin = time.monotonic() + _WARM_S
-        spec = {"begin": begin, "end": begin + seconds}
-        pending = [(part, part.start({"active": share, **spec})) for part, share in shares if share]
-        return [calls for part, handle in pending for calls in part.result(handle, seconds + _LATE_S)]
+    def run(self, robots: int, simulations: int, seconds: float) -> list[list[Call]]:
+        """Run clients for `seconds`; returns the calls of each, the robot first."""
+        counts = _shares(simulations, len(self.parts) - 1) if self.parts[1:] else [simulations]
+        shares = [(robots, 0)] * bool(self.parts[1:]) + [(0, count) for count in counts]
+        shares[0] = (robots, shares[0][1])
+        with self.turn():
+            begin = time.monotonic() + _WARM_S
+            spec = {"begin": begin, "end": begin + seconds}
+            pending = [
+                (part, part.start({"robots": some, "simulations": more, **spec}))
+                for part, (some, more) in zip(self.parts, shares, strict=True)
+                if some + more
+            ]
+            return [calls for part, handle in pending for calls in part.result(handle, seconds + _LATE_S)]
 
 
 @contextlib.contextmanager
-def _fleet(client: OwnClient, url: str, app: str, clients: int) -> Iterator[_Fleet]:
-    parts = min(_PROCESSES, clients)
-    ranks = [[ROBOT], *([SIMULATION] * size for size in _shares(clients, parts))]
+def _fleet(client: OwnClient, url: str, app: str, clients: int) -> Iterator[Fleet]:
+    make = _actor if client.actor else _process
+    address = f"serve://{app}" if client.actor else url
     with contextlib.ExitStack() as stack:
-        make = _actor if client.actor else _process
-        address = f"serve://{app}" if client.actor else url
-        made = [stack.enter_context(make(client, address, one)) for one in ranks]
-        yield _Fleet(made[1:], made[0])
+        yield Fleet([stack.enter_context(make(client, address, *part)) for part in _parts(clients)])
 
 
 @contextlib.contextmanager
-def _process(client: OwnClient, url: str, ranks: list[str]) -> Iterator[_Part]:
-    settings = json.dumps({"url": url, "transport": client.transport, "codec": client.codec, "ranks": ranks})
-    command = [sys.executable, "-m", "benchmarks.own_clients", settings]
+def peer_fleet(
+    client: others.PeerClient, plan: ThroughputPlan, obs: Path, running: dict[str, others.PeerServer]
+) -> Iterator[Fleet]:
+    """Start a peer's server, unless `running` has one that it shares, and its clients, within a context."""
+    most = max(plan.clients)
+    policy = {name: float(plan.config.get(name, 0.0)) for name in ("base_ms", "per_item_ms")} | {"batch": plan.batch}
+    with contextlib.ExitStack() as stack:
+        server = stack.enter_context(others.serving(client, plan.peers_python, running, policy))
+        words = [*client.command(plan.peers_python), "load", *server.address, str(obs), client.mode, json.dumps(policy)]
+        children = [
+            stack.enter_context(LineProcess(f"clients of {client.name}", [*words, *map(str, part)], others.ALONE))
+            for part in ([(1, most)] if client.one_process else _parts(most))
+        ]
+        for child in children:
+            child.read(others.READY_S)
+        server.signal(signal.SIGSTOP)
+        yield Fleet([_part(child) for child in children], server.turn)
+
+
+def _parts(clients: int) -> list[tuple[int, int]]:
+    """Return the robots and simulations of each process."""
+    return [(1, 0), *((0, size) for size in _shares(clients, min(_PROCESSES, clients)))]
+
+
+def _part(child: LineProcess) -> _Part:
+    return _Part(lambda spec: child.send(json.dumps(spec)), lambda _, late: child.read(late))
+
+
+@contextlib.contextmanager
+def _process(client: OwnClient, url: str, robots: int, simulations: int) -> Iterator[_Part]:
+    settings = {"url": url, "transport": client.transport, "codec": client.codec}
+    command = [sys.executable, "-m", "benchmarks.own_clients"]
+    command.append(json.dumps(settings | {"robots": robots, "simulations": simulations}))
     with LineProcess(f"clients by {client.name}", command, our_environment()) as child:
         child.read(START_S)
-        yield _Part(lambda spec: child.send(json.dumps(spec)), lambda _, late: child.read(late))
+        yield _part(child)
 
 
 @contextlib.contextmanager
-def _actor(client: OwnClient, url: str, ranks: list[str]) -> Iterator[_Part]:
+def _actor(client: OwnClient, url: str, robots: int, simulations: int) -> Iterator[_Part]:
     import ray
 
-    actor = ray.remote(num_cpus=0)(LoadGenerator).remote(url, client.transport, client.codec, ranks)
+    actor = ray.remote(num_cpus=0)(LoadGenerator).remote(url, client.transport, client.codec, robots, simulations)
     try:
         ray.get(actor.ready.remote(), timeout=START_S)
         yield _Part(lambda spec: actor.run.remote(**spec), lambda pending, late: ray.get(pending, timeout=late))
@@ -208,13 +250,26 @@ def _one_each(found: Sequence[OwnClient]) -> list[OwnClient]:
     return list(first.values())
 
 
-def _point(plan: ThroughputPlan, fleet: _Fleet, clients: int) -> dict[str, Any]:
-    calls = fleet.run(clients, plan.seconds)
-    rate = rate_of(calls)
-    flat = [call for one in calls for call in one]
+def _row(plan: ThroughputPlan, turns: _Turns, best: float) -> dict[str, Any]:
+    curve = [_point(plan, k, turns.calls[k]) for k in plan.clients]
+    return {
+        "actions_per_s": curve[-1]["actions_per_s"],
+        "rounds": curve[-1]["rounds"],
+        "of_ideal": curve[-1]["actions_per_s"] / best,
+        "curve": curve,
+        "robot": _waiting(turns.robot),
+    }
+
+
+def _point(plan: ThroughputPlan, clients: int, rounds: Sequence[Sequence[Sequence[Call]]]) -> dict[str, Any]:
+    rates = [rate_of(calls) for calls in rounds]
+    rate = statistics.mean(rates)
+    flat = [call for calls in rounds for one in calls for call in one]
     return {
         "clients": clients,
         "actions_per_s": rate,
+        "rounds": rates,
+        "ci95": mean_interval(rates),
         "of_ideal": rate / plan.ideal(clients) if plan.ideal else None,
         # A batch counts once for each of its members: the harmonic mean undoes that.
         "mean_batch": len(flat) / sum(1 / size for *_, size in flat) if flat else None,
@@ -232,6 +287,7 @@ def _waiting(calls: Sequence[Call]) -> dict[str, Any] | None:
     return {
         "calls": len(calls),
         "wait_p50_ms": float(np.median(wait)),
+        "wait_ci95_ms": list(median_interval(wait)),
         "wait_p99_ms": float(np.quantile(wait, 0.99)),
         "round_trip_p50_ms": float(np.median(round_trip)),
         "round_trip_p99_ms": float(np.quantile(round_trip, 0.99)),
@@ -248,6 +304,8 @@ def main(
     policy: Annotated[str | None, typer.Option(help="Default: noop, 20 ms + 1 ms an observation.")] = None,
     settings: Set = [],  # noqa: B006
     num_gpus: Annotated[float, typer.Option(min=0, help="That Ray gives to the replica.")] = 0.0,
+    peers: others.Peers = "",
+    peers_python: others.PeersPython = others.PYTHON,
     json_file: Json = None,
 ) -> None:
     """Measure actions a second of many clients on one replica, against the ideal, or the bare policy."""
@@ -258,28 +316,34 @@ def main(
         chosen: dict[str, Any] = (
             {} if policy is None else {"policy": policy, "config": parse_settings(settings, "--set")}
         )
+        if peers and chosen.get("policy", "noop") != "noop":
+            raise ConfigError(f"--peers: they sleep as the policy noop does; got --policy {policy}")
         counts = parse_counts(clients, "--clients")
         plan = ThroughputPlan(
             **chosen, num_gpus=num_gpus, batch=batch, clients=counts, seconds=seconds, rounds=rounds,
-            robot_seconds=robot_seconds, transports=parse_list(transports),
+            robot_seconds=robot_seconds, transports=parse_list(transports), peers=parse_list(peers),
+            peers_python=peers_python,
         )  # fmt: skip
         found = measure_throughput(plan, progress)
     show_throughput(found)
-    save({**origin, **found}, json_file)
+    save({**origin, **found, "versions": origin["versions"] | found["versions"]}, json_file)
 
 
 def show_throughput(found: Mapping[str, Any]) -> None:
     """Print a row for each number of clients, and a sentence for each transport."""
-    rows = table("transport", "clients", "actions/s", "of ideal", "mean batch", "p50 ms", "p99 ms")
+    rows = table(
+        "transport or peer", "clients", "actions/s", "95 % interval", "of ideal", "mean batch", "p50 ms", "p99 ms"
+    )
     rows.title = f"{found['policy']}, ideal {found['ideal_actions_per_s']:.0f} actions/s ({found['ideal_is']})"
-    for name, row in found["transports"].items():
+    for name, row in (found["transports"] | found["peers"]).items():
         for point in row["curve"]:
             numbers = [point[key] for key in ("of_ideal", "mean_batch", "p50_ms", "p99_ms")]
             cells = ["" if number is None else f"{number:.3g}" for number in numbers]
-            rows.add_row(name, str(point["clients"]), f"{point['actions_per_s']:.1f}", *cells)
+            interval = "{:.1f} to {:.1f}".format(*point["ci95"]) if point["ci95"] else ""
+            rows.add_row(name, str(point["clients"]), f"{point['actions_per_s']:.1f}", interval, *cells)
         rows.add_section()
     out.print(rows)
-    for name, row in found["transports"].items():
+    for name, row in (found["transports"] | found["peers"]).items():
         robot = row["robot"]
         waits = (
             f"; a robot among simulations waits {robot['wait_p50_ms']:.1f} ms (p99 {robot['wait_p99_ms']:.1f})"

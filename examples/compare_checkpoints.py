@@ -43,8 +43,9 @@ def main():
         suites=[{"name": env, "envs": [env], "episodes": 20} for env in ENVS],
         out=time.strftime("runs/compared-%H%M%S"),
         video="none",
+        workers=0,
     )
-    evaluate(plan, agent_factory=Trainee, in_process=True)
+    evaluate(plan, agent_factory=Trainee)
 
     results = Results.load(plan.out)
     found = compare(results, "trainee@8000", "trainee@2000")

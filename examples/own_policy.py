@@ -76,6 +76,6 @@ if __name__ == "__main__":
     with make_env(env) as crane:
         check_agent(Servo(), obs=crane.reset(seed=0)[0])  # raises what is wrong with it
     out = time.strftime("runs/servo-%H%M%S")
-    plan = EvalConfig(policies=[{"name": "servo"}], suites=[{"envs": [env], "episodes": 20}], out=out)
-    summary = evaluate(plan, agent_factory=lambda: Servo(ServoConfig(camera_turn=120)), in_process=True)
+    plan = EvalConfig(policies=[{"name": "servo"}], suites=[{"envs": [env], "episodes": 20}], workers=0, out=out)
+    summary = evaluate(plan, agent_factory=lambda: Servo(ServoConfig(camera_turn=120)))
     print_summary(Console(), summary)

@@ -27,10 +27,11 @@ def main():
             for turn in TURNS
         ],
         out="runs/sweep",
+        workers=0,
         video="none",
         resume=True,
     )
-    summary = evaluate(plan, agent_factory=lambda: Servo(ServoConfig(camera_turn=CALIBRATED)), in_process=True)
+    summary = evaluate(plan, agent_factory=lambda: Servo(ServoConfig(camera_turn=CALIBRATED)))
     print("success, 95 % interval".ljust(24), *(f"{turn}°".ljust(15) for turn in TURNS))
     for policy, group in groupby(summary.cells, lambda cell: cell.contender):
         cells = list(group)

@@ -58,8 +58,8 @@ def main(url):
     config = {"protocol": "openpi", "urls": [url], "mapping": MAPPING, "contract": {"action": {"dim": 4}, "chunk": 10}}
     suite = {"envs": ["tabletop/lift"], "episodes": 3}
     out = time.strftime("runs/upstream-%H%M%S")
-    plan = EvalConfig(policies=[{"name": "theirs"}], suites=[suite], out=out, video="none")
-    print_summary(Console(), evaluate(plan, agent_factory=lambda: Upstream.from_config(config), in_process=True))
+    plan = EvalConfig(policies=[{"name": "theirs"}], suites=[suite], out=out, video="none", workers=0)
+    print_summary(Console(), evaluate(plan, agent_factory=lambda: Upstream.from_config(config)))
 
 
 if __name__ == "__main__":

@@ -10,7 +10,9 @@ The tables of README and docs/ are made from this file: `python tests/support/ta
 
 from __future__ import annotations
 
+import functools
 import importlib
+import sys
 from collections.abc import Iterator
 from dataclasses import dataclass
 from importlib.metadata import entry_points
@@ -333,8 +335,13 @@ def names(kind: str) -> dict[str, str]:
     """Return all names of `kind` ("policies", "wrappers", "envs" or "dialects") with their "module:Class"."""
     adapters = {"policies": POLICIES, "envs": ENVS}.get(kind, {})
     own = DIALECTS if kind == "dialects" else {name: one.target for name, one in adapters.items()}
-    found = {point.name: point.value for point in entry_points(group=f"vlagents_ray.{kind}")}
-    return found | own
+    return _registered(f"vlagents_ray.{kind}", tuple(sys.path)) | own
+
+
+@functools.cache
+def _registered(group: str, _path: tuple[str, ...]) -> dict[str, str]:
+    """Return the entry points of a group on this path; reading those of all installed packages takes 20 ms."""
+    return {point.name: point.value for point in entry_points(group=group)}
 
 
 def policy_class(name: str) -> type[Any]:

@@ -8,11 +8,10 @@ event loop, and both timings in the reply.
 from __future__ import annotations
 
 import asyncio
-import sys
+import functools
 import time
-from typing import Any, TextIO
+from typing import Any
 
-import numpy as np
 import peer
 import websockets
 import websockets.asyncio.server
@@ -20,12 +19,7 @@ from openpi_client import msgpack_numpy
 from openpi_client.websocket_client_policy import WebsocketClientPolicy
 
 
-def infer(_obs: dict[str, Any]) -> dict[str, Any]:
-    """Return a chunk of one action, as a policy that does nothing."""
-    return {"actions": np.zeros((1, 7), np.float32), "policy_timing": {"infer_ms": 0.0}}
-
-
-async def handler(websocket: websockets.asyncio.server.ServerConnection) -> None:
+async def handler(policy: peer.Policy, websocket: websockets.asyncio.server.ServerConnection) -> None:
     """Serve one connection."""
     packer = msgpack_numpy.Packer()
     await websocket.send(packer.pack({}))
@@ -33,9 +27,9 @@ async def handler(websocket: websockets.asyncio.server.ServerConnection) -> None
     while True:
         try:
             begun = time.monotonic()
-            obs = msgpack_numpy.unpackb(await websocket.recv())
+            msgpack_numpy.unpackb(await websocket.recv())
             inference = time.monotonic()
-            action = infer(obs)
+            action: dict[str, Any] = {"actions": policy(), "policy_timing": {"infer_ms": 0.0}}
             action["server_timing"] = {"infer_ms": (time.monotonic() - inference) * 1000}
             if previous is not None:
                 action["server_timing"]["prev_total_ms"] = previous * 1000
@@ -45,28 +39,28 @@ async def handler(websocket: websockets.asyncio.server.ServerConnection) -> None
             return
 
 
-def serve(host: str, port: int) -> None:
+def serve(host: str, port: int, policy: peer.Policy) -> None:
     """Run the server until the process ends."""
 
     async def forever() -> None:
-        async with websockets.asyncio.server.serve(handler, host, port, compression=None, max_size=None) as server:
+        handle = functools.partial(handler, policy)
+        async with websockets.asyncio.server.serve(handle, host, port, compression=None, max_size=None) as server:
             await server.serve_forever()
 
     asyncio.run(forever())
 
 
-def drive(host: str, port: int, path: str, _mode: str, out: TextIO) -> None:
-    """Drive the server with openpi's own client."""
-    arrays = peer.observation(path)
+def connect(target: peer.Target) -> peer.Client:
+    """Connect openpi's own client."""
     obs = {
-        "observation/image": arrays["camera_0"],
-        "observation/wrist_image": arrays["camera_1"],
-        "observation/state": np.append(arrays["joints"], np.float32(arrays["gripper"])),
+        "observation/image": target.arrays["camera_0"],
+        "observation/wrist_image": target.arrays["camera_1"],
+        "observation/state": target.state,
         "prompt": "measure",
     }
-    client = WebsocketClientPolicy(host, port)
-    peer.obey(sys.stdin, out, lambda calls: peer.timed(lambda: obs, client.infer, calls), {})
+    client = WebsocketClientPolicy(target.host, target.port)
+    return peer.Client(lambda: obs, lambda obs: client.infer(obs)["actions"])
 
 
 if __name__ == "__main__":
-    peer.run(serve, drive)
+    peer.run(serve, connect)

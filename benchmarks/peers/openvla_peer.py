@@ -9,8 +9,7 @@ so that every server gets the same observation.
 from __future__ import annotations
 
 import json
-import sys
-from typing import Any, TextIO
+from typing import Any
 
 import json_numpy
 import peer
@@ -24,7 +23,7 @@ from fastapi import FastAPI  # noqa: E402
 from fastapi.responses import JSONResponse  # noqa: E402
 
 
-def predict_action(payload: dict[str, Any]) -> JSONResponse:
+def predict_action(policy: peer.Policy, payload: dict[str, Any]) -> JSONResponse:
     """Answer `POST /act`; FastAPI runs it in its thread pool, like OpenVLA's."""
     double_encoded = "encoded" in payload
     if double_encoded:
@@ -32,34 +31,38 @@ def predict_action(payload: dict[str, Any]) -> JSONResponse:
     for name in ("image", "wrist_image"):
         if not isinstance(payload[name], np.ndarray):
             raise TypeError(f"{name}: got {type(payload[name]).__name__}, want an array; is json_numpy patched in?")
-    action = np.zeros(7, np.float32)
+    (action,) = policy()
     return JSONResponse(json_numpy.dumps(action)) if double_encoded else JSONResponse(action)
 
 
-def serve(host: str, port: int) -> None:
+def serve(host: str, port: int, policy: peer.Policy) -> None:
     """Run the server until the process ends."""
     app = FastAPI()
-    app.post("/act", response_model=None)(predict_action)
+
+    @app.post("/act", response_model=None)
+    def act(payload: dict[str, Any]) -> JSONResponse:
+        return predict_action(policy, payload)
+
     uvicorn.run(app, host=host, port=port)
 
 
-def drive(host: str, port: int, path: str, _mode: str, out: TextIO) -> None:
-    """Drive the server with the client of OpenVLA's documentation."""
-    arrays = peer.observation(path)
+def connect(target: peer.Target) -> peer.Client:
+    """Make the client of OpenVLA's documentation."""
     obs = {
-        "image": arrays["camera_0"],
-        "wrist_image": arrays["camera_1"],
-        "state": np.append(arrays["joints"], np.float32(arrays["gripper"])),
+        "image": target.arrays["camera_0"],
+        "wrist_image": target.arrays["camera_1"],
+        "state": target.state,
         "instruction": "measure",
     }
 
-    def call(obs: dict[str, Any]) -> None:
-        action = requests.post(f"http://{host}:{port}/act", json=obs).json()  # noqa: S113 - as its users write it
+    def act(obs: dict[str, Any]) -> np.ndarray:
+        action = requests.post(f"http://{target.host}:{target.port}/act", json=obs).json()  # noqa: S113 - as its users
         if not isinstance(action, np.ndarray):
             raise TypeError(f"got {action!r}, want an action")
+        return action
 
-    peer.obey(sys.stdin, out, lambda calls: peer.timed(lambda: obs, call, calls), {})
+    return peer.Client(lambda: obs, act)
 
 
 if __name__ == "__main__":
-    peer.run(serve, drive)
+    peer.run(serve, connect)

@@ -1,10 +1,11 @@
-"""Common parts of the scripts: the line protocol, and the end of a process with the benchmark.
+"""Common parts of the scripts: the line protocol, the policy, and the end of a process with the benchmark.
 
 It imports only the standard library and numpy, as it runs in other environments.
 """
 
 from __future__ import annotations
 
+import functools
 import importlib.util
 import json
 import os
@@ -13,42 +14,106 @@ import socket
 import sys
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
 from pathlib import Path
+from types import ModuleType
 from typing import TYPE_CHECKING, Any, TextIO
 
 import numpy as np
 
 if TYPE_CHECKING:
+    from benchmarks.closed_loop import ClosedLoop
     from vlagents_ray.bench.line_client import die_with_parent, obey, own_stdout, timed
-else:  # the peers' Python has no vlagents_ray: the file is loaded by its path
-    _FILE = Path(__file__).parents[2] / "vlagents_ray" / "bench" / "line_client.py"
-    _SPEC = importlib.util.spec_from_file_location("line_client", _FILE)
-    _MODULE = importlib.util.module_from_spec(_SPEC)
-    _SPEC.loader.exec_module(_MODULE)
-    die_with_parent, obey = _MODULE.die_with_parent, _MODULE.obey
-    own_stdout, timed = _MODULE.own_stdout, _MODULE.timed
+else:  # the peers' Python has no vlagents_ray: files are loaded by their paths
 
-__all__ = ["die_with_parent", "obey", "observation", "own_stdout", "run", "timed", "wait_for_port"]
+    def _load(path: str) -> ModuleType:
+        file = Path(__file__).parents[2] / path
+        spec = importlib.util.spec_from_file_location(file.stem, file)
+        module = importlib.util.module_from_spec(spec)
+        spec.loader.exec_module(module)
+        return module
 
-_START_S = 60.0
+    _LINES = _load("vlagents_ray/bench/line_client.py")
+    die_with_parent, obey, own_stdout, timed = _LINES.die_with_parent, _LINES.obey, _LINES.own_stdout, _LINES.timed
+    ClosedLoop = _load("benchmarks/closed_loop.py").ClosedLoop
+
+__all__ = ["Client", "Policy", "Target", "die_with_parent", "run", "wait_for_port"]
+
+_START_S = 180.0
+
+if Path(sys.argv[0]).resolve().parent == Path(__file__).resolve().parent:  # also in processes that a script spawns
+    die_with_parent()
 
 
-def end_with_stdin() -> None:
-    """End this process, a server, as soon as its standard input ends."""
+class Policy:
+    """Seven numbers for each row of a batch, of which the first is the size of the batch.
+
+    A batch of B takes `base_ms + per_item_ms * B`. Only one batch is computed at a time, as on an accelerator.
+    """
+
+    def __init__(self, base_ms: float = 0.0, per_item_ms: float = 0.0, batch: int = 1) -> None:
+        self.base_ms, self.per_item_ms, self.batch = base_ms, per_item_ms, batch
+        self._busy = threading.Lock()
+
+    def __call__(self, rows: int = 1) -> np.ndarray:
+        """Compute a batch; returns (rows, 7) float32."""
+        actions = np.zeros((rows, 7), np.float32)
+        actions[:, 0] = rows
+        with self._busy:
+            if taken := self.ms(rows):
+                time.sleep(taken / 1e3)
+        return actions
+
+    def ms(self, rows: int) -> float:
+        """Return the time that a batch takes, ms; 0: none."""
+        return self.base_ms + self.per_item_ms * rows if self.base_ms or self.per_item_ms else 0.0
+
+    def __reduce__(self) -> tuple[type[Policy], tuple[float, float, int]]:
+        return Policy, (self.base_ms, self.per_item_ms, self.batch)
+
+
+@dataclass(frozen=True, eq=False)
+class Target:
+    """A server, and what its clients need."""
+
+    host: str
+    port: int
+    arrays: Mapping[str, np.ndarray]  # camera_0, … (H, W, 3) uint8 RGB; joints (7,) float32; gripper () float64
+    mode: str
+    policy: Policy
+    clients: int  # of this process
+
+    @property
+    def cameras(self) -> dict[str, np.ndarray]:
+        return {name: image for name, image in self.arrays.items() if name.startswith("camera_")}
+
+    @property
+    def state(self) -> np.ndarray:
+        """The joints and the gripper, (8,) float32."""
+        return np.append(self.arrays["joints"], np.float32(self.arrays["gripper"]))
+
+
+@dataclass(frozen=True)
+class Client:
+    """One connection. Only `act` is timed: it returns the action that the policy gave, (7,)."""
+
+    observe: Callable[[], Any]
+    act: Callable[[Any], Any]
+    close: Callable[[], None] = lambda: None
+    before: Callable[[int, float], None] = lambda _clients, _end: None  # each run: number of clients, and its end
+
+
+def end_with_stdin(end: Callable[[], None] = lambda: None) -> None:
+    """End this process, a server, as soon as its standard input ends; before that, call `end`."""
 
     def wait() -> None:
         while os.read(0, 4096):
             pass
+        end()
         os._exit(0)
 
     threading.Thread(target=wait, daemon=True).start()
-
-
-def observation(path: str) -> dict[str, np.ndarray]:
-    """Load the observation: `camera_0`, … (H, W, 3) uint8 RGB; `joints` (7,) float32; `gripper` () float64."""
-    with np.load(path, allow_pickle=False) as arrays:
-        return {name: arrays[name] for name in arrays.files}
 
 
 def _stdin_has_ended() -> bool:
@@ -59,7 +124,7 @@ def _stdin_has_ended() -> bool:
 
 
 def wait_for_port(host: str, port: int) -> None:
-    """Wait until a server listens; `TimeoutError` after a minute. Ends this process if its input ends."""
+    """Wait until a server listens; `TimeoutError` after three minutes. Ends this process if its input ends."""
     deadline = time.monotonic() + _START_S
     while True:
         try:
@@ -75,25 +140,64 @@ def wait_for_port(host: str, port: int) -> None:
 
 
 def run(
-    serve: Callable[[str, int], None],
-    drive: Callable[[str, int, str, str, TextIO], None],
+    serve: Callable[[str, int, Policy], None] | None,
+    connect: Callable[[Target], Client],
     evaluate: Callable[[str, int, dict[str, Any]], None] | None = None,
+    *,
+    end: Callable[[], None] = lambda: None,
 ) -> None:
-    """Run the command of a script: `serve HOST PORT`, `drive HOST PORT OBS.npz MODE`, `evaluate HOST PORT PLAN`.
+    """Run the command of a script.
 
-    PLAN is JSON; `evaluate` writes a line when all its episodes are played and all its processes have ended.
+    Its commands are `serve HOST PORT POLICY`; `drive HOST PORT OBS.npz MODE POLICY`, a client that makes calls in its
+    turn; `load … ROBOTS SIMULATIONS`, with the same words before, clients that make load; `evaluate HOST PORT PLAN`,
+    which writes a line when all its episodes are played and all its processes have ended. POLICY and PLAN are JSON.
+    Without `serve`, the clients' process starts its server. `end` ends what the server's process has started, if that
+    does not end with it.
     """
     die_with_parent()
     out = own_stdout()
     command, host, port = sys.argv[1], sys.argv[2], int(sys.argv[3])
-    if command == "serve":
-        end_with_stdin()
-        serve(host, port)
+    if command == "serve" and serve is not None:
+        end_with_stdin(end)
+        serve(host, port, Policy(**json.loads(sys.argv[4])))
     elif command == "evaluate" and evaluate is not None:
         end_with_stdin()
         os.register_at_fork(after_in_child=die_with_parent)
         evaluate(host, port, json.loads(sys.argv[4]))
         print(json.dumps({}), file=out, flush=True)
     else:
-        wait_for_port(host, port)
-        drive(host, port, sys.argv[4], sys.argv[5], out)
+        if serve is not None:
+            wait_for_port(host, port)
+        with np.load(sys.argv[4], allow_pickle=False) as saved:
+            arrays = {name: saved[name] for name in saved.files}
+        robots, simulations = (int(word) for word in sys.argv[7:9] or (0, 1))
+        policy = Policy(**json.loads(sys.argv[6]))
+        target = Target(host, port, arrays, sys.argv[5], policy, robots + simulations)
+        clients = [connect(target) for _ in range(target.clients)]
+        try:
+            if command == "drive":
+                (client,) = clients
+                obey(sys.stdin, out, lambda calls: timed(client.observe, client.act, calls), {})
+            else:
+                _make_load(clients, robots, policy, out)
+        finally:
+            for client in clients:
+                client.close()
+
+
+def _make_load(clients: list[Client], robots: int, policy: Policy, out: TextIO) -> None:
+    """Answer each line, the arguments of `ClosedLoop.run`, with its calls."""
+
+    def act(client: Client) -> tuple[float, float, int]:
+        obs = client.observe()
+        begun = time.perf_counter()
+        rows = int(np.ravel(client.act(obs))[0])
+        return (time.perf_counter() - begun) * 1e3, policy.ms(rows), rows
+
+    loop = ClosedLoop([functools.partial(act, client) for client in clients], robots)
+    print(json.dumps(True), file=out, flush=True)
+    for line in sys.stdin:
+        wanted = json.loads(line)
+        for client in clients:
+            client.before(wanted["robots"] + wanted["simulations"], wanted["end"])
+        print(json.dumps(loop.run(**wanted)), file=out, flush=True)

@@ -14,7 +14,7 @@ import json
 import subprocess
 import sys
 from pathlib import Path
-from typing import Any, TextIO
+from typing import Any
 
 import numpy as np
 import peer
@@ -26,79 +26,74 @@ from vla_eval.model_servers.serve import serve as serve_forever
 from vla_eval.protocol.numpy_codec import set_image_format
 
 
-class VlaEvalNoop(PredictModelServer):
-    """A model of vla-eval that answers each observation with seven zeros."""
+class VlaEvalPolicy(PredictModelServer):
+    """A model of vla-eval; it takes batches if the policy does."""
+
+    def __init__(self, policy: peer.Policy) -> None:
+        super().__init__(max_batch_size=policy.batch)
+        self._policy = policy
 
     def predict(self, obs: dict[str, Any], ctx: Any) -> dict[str, Any]:
-        return {"actions": np.zeros(7, np.float32)}
+        return {"actions": self._policy()[0]}
+
+    def predict_batch(self, obs_batch: list[dict[str, Any]], ctx_batch: list[Any]) -> list[dict[str, Any]]:
+        return [{"actions": action} for action in self._policy(len(obs_batch))]
 
 
-class VlaEvalTabletop(StepBenchmark):
+class VlaEvalTimed(StepBenchmark):
     """The environment that all systems play; each shard imports it by name."""
 
     def __init__(self, seed: int, env: dict[str, Any]) -> None:
-        from benchmarks.environments import TimedTabletop
+        from benchmarks.environments import TimedEnv
         from vlagents_ray.interface import Act
 
         super().__init__()
         set_image_format("raw")
         self._seed = seed
-        self._env, self._act = TimedTabletop(**env), Act
+        self._env, self._act = TimedEnv(**env), Act
 
     def get_tasks(self) -> list[dict[str, Any]]:
-        return [{"name": "tabletop"}]
+        return [{"name": "timed"}]
 
     def reset(self, task: dict[str, Any]) -> Any:
         return self._env.reset(seed=self._seed + task["episode_idx"])[0]
 
     def step(self, action: dict[str, Any]) -> StepResult:
-        obs, reward, terminated, truncated, info = self._env.step(self._act(action["actions"][:4]))
+        obs, reward, terminated, truncated, info = self._env.step(
+            self._act(action["actions"][: self._env.contract.action.dim])
+        )
         return StepResult(obs, reward, terminated or truncated, info)
 
     def make_obs(self, raw_obs: Any, task: dict[str, Any]) -> dict[str, Any]:
-        state = np.append(raw_obs.state["xyzrpy"], np.float32(raw_obs.gripper))
+        state = np.concatenate(list(raw_obs.state.values()))
         return {"images": raw_obs.cameras, "task_description": self._env.instruction, "state": state}
 
     def get_step_result(self, step_result: StepResult) -> dict[str, Any]:
         return {"success": step_result.info["success"]}
 
 
-def serve(host: str, port: int) -> None:
+def serve(host: str, port: int, policy: peer.Policy) -> None:
     """Run the server as vla-eval's `run_server` does."""
-    serve_forever(VlaEvalNoop(), host, port)
+    serve_forever(VlaEvalPolicy(policy), host, port)
 
 
-def drive(host: str, port: int, path: str, mode: str, out: TextIO) -> None:
-    """Drive the server with vla-eval's own client, on a new event loop."""
-    if mode != "png":
-        set_image_format(mode)
-    arrays = peer.observation(path)
-    obs = {
-        "images": {name: image for name, image in arrays.items() if name.startswith("camera_")},
-        "task_description": "measure",
-        "state": np.append(arrays["joints"], np.float32(arrays["gripper"])),
-    }
+def connect(target: peer.Target) -> peer.Client:
+    """Connect vla-eval's own client, on a new event loop."""
+    if target.mode != "png":
+        set_image_format(target.mode)
+    obs = {"images": target.cameras, "task_description": "measure", "state": target.state}
     loop = asyncio.new_event_loop()
-    connection = Connection(f"ws://{host}:{port}")
+    connection = Connection(f"ws://{target.host}:{target.port}")
     loop.run_until_complete(connection.connect())
     loop.run_until_complete(connection.start_episode({"task": {"name": "measure"}}))
-
-    async def measure(calls: int) -> list[float]:
-        taken = []
-        for _ in range(calls):
-            begun = loop.time()
-            await connection.act(obs)
-            taken.append((loop.time() - begun) * 1e3)
-        return taken
-
-    peer.obey(sys.stdin, out, lambda calls: loop.run_until_complete(measure(calls)), {})
+    return peer.Client(lambda: obs, lambda obs: loop.run_until_complete(connection.act(obs))["actions"])
 
 
 def evaluate(host: str, port: int, plan: dict[str, Any]) -> None:
     """Start the server, play the shards, and export their results."""
     folder = Path(plan["folder"])
     benchmark = {
-        "benchmark": "vla_eval_peer:VlaEvalTabletop",
+        "benchmark": "vla_eval_peer:VlaEvalTimed",
         "episodes_per_task": plan["episodes"],
         "max_steps": plan["env"]["max_steps"],
         "params": {"seed": plan["seed"], "env": plan["env"]},
@@ -106,7 +101,7 @@ def evaluate(host: str, port: int, plan: dict[str, Any]) -> None:
     config = folder / "run.yaml"
     config.write_text(json.dumps({"server": {"url": f"ws://{host}:{port}"}, "benchmarks": [benchmark]}))
     common = ["--output-dir", str(folder), "--eval-id", "bench", "--num-shards", str(plan["workers"]), "--shard-id"]
-    server = _start("serve", host, str(port))
+    server = _start("serve", host, str(port), "{}")
     peer.wait_for_port(host, port)
     shards = [
         _start("run", "--no-docker", "--config", str(config), *common, str(shard)) for shard in range(plan["workers"])
@@ -131,4 +126,4 @@ if __name__ == "__main__":
         peer.die_with_parent()
         main()
     else:
-        peer.run(serve, drive, evaluate)
+        peer.run(serve, connect, evaluate)

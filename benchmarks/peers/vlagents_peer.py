@@ -14,9 +14,8 @@ from __future__ import annotations
 import json
 import sys
 from pathlib import Path
-from typing import Any, TextIO
+from typing import Any
 
-import numpy as np
 import peer
 import rpyc
 from vlagents import register_agent, register_env
@@ -30,25 +29,27 @@ NAME = "bench_noop"
 ENV = "bench_tabletop"
 
 
-class VlagentsNoop(Agent):
-    """Decodes the observation and returns seven zeros. `run-eval` passes a device to every policy."""
+class VlagentsPolicy(Agent):
+    """Decodes the observation and runs the policy. `run-eval` passes a device to every policy."""
+
+    policy = peer.Policy()
 
     def __init__(self, device: str | None = None, checkpoint_step: int | None = None) -> None:
         super().__init__(default_checkpoint_path="", checkpoint_step=checkpoint_step)
 
     def act(self, obs: Obs) -> Act:
         super().act(obs)
-        return self._single_step_act("robot", np.zeros(7, np.float32))
+        return self._single_step_act("robot", self.policy()[0])
 
 
 class VlagentsTabletop(EvalEnv):
     """The environment that all systems play."""
 
     def do_import(self) -> None:
-        from benchmarks.environments import TimedTabletop
+        from benchmarks.environments import TimedEnv
         from vlagents_ray.interface import Act
 
-        self._make, self._act = TimedTabletop, Act
+        self._make, self._act = TimedEnv, Act
 
     def make_gym(self) -> Any:
         return self._make(**self.env_kwargs)
@@ -78,33 +79,32 @@ class VlagentsTabletop(EvalEnv):
         return self._last
 
 
-register_agent(NAME, VlagentsNoop)
+register_agent(NAME, VlagentsPolicy)
 register_env(ENV, VlagentsTabletop)
 
 
-def serve(host: str, port: int) -> None:
+def serve(host: str, port: int, policy: peer.Policy) -> None:
     """Run the server as `vlagents start-server` does."""
-    service = AgentService(VlagentsNoop(), NAME)
+    VlagentsPolicy.policy = policy
+    service = AgentService(VlagentsPolicy(), NAME)
     with service:
         rpyc.ThreadedServer(
             service, port=port, hostname=host, protocol_config={"allow_pickle": True, "allow_public_attrs": True}
         ).start()
 
 
-def drive(host: str, port: int, path: str, mode: str, out: TextIO) -> None:
-    """Drive the server with vlagents' own client."""
-    arrays = peer.observation(path)
-    cameras = {name: image for name, image in arrays.items() if name.startswith("camera_")}
+def connect(target: peer.Target) -> peer.Client:
+    """Connect vlagents' own client."""
+    gripper, joints = float(target.arrays["gripper"]), target.arrays["joints"]
 
-    def obs() -> Obs:
-        robot = SingleObs(cameras=dict(cameras), gripper=float(arrays["gripper"]), joints=arrays["joints"])
+    def observe() -> Obs:
+        robot = SingleObs(cameras=dict(target.cameras), gripper=gripper, joints=joints)
         return Obs(obs={"robot": robot}, language_instruction="measure")
 
-    agent = RemoteAgent(host, port, NAME, on_same_machine=mode == "shm", jpeg_encoding=mode == "jpeg")
-    try:
-        peer.obey(sys.stdin, out, lambda calls: peer.timed(obs, agent.act, calls), {})
-    finally:
-        agent.close()
+    agent = RemoteAgent(
+        target.host, target.port, NAME, on_same_machine=target.mode == "shm", jpeg_encoding=target.mode == "jpeg"
+    )
+    return peer.Client(observe, lambda obs: agent.act(obs).acts[0]["robot"].action, agent.close)
 
 
 def evaluate(host: str, port: int, plan: dict[str, Any]) -> None:
@@ -142,4 +142,4 @@ if __name__ == "__main__":
         peer.die_with_parent()
         main_app()
     else:
-        peer.run(serve, drive, evaluate)
+        peer.run(serve, connect, evaluate)

@@ -8,7 +8,20 @@ import pytest
 import typer
 from typer.testing import CliRunner
 
-from benchmarks import autoscaling, evaluation, far_away, hop, policy, report, rtt, scaling, success, throughput
+from benchmarks import (
+    autoscaling,
+    evaluation,
+    far_away,
+    growth,
+    hop,
+    policy,
+    report,
+    rollouts,
+    rtt,
+    scaling,
+    success,
+    throughput,
+)
 from benchmarks.checkpoints import __main__ as checkpoints
 
 
@@ -22,12 +35,15 @@ from benchmarks.checkpoints import __main__ as checkpoints
         (evaluation, ["--episodes", "5"], "multiple of the 2 workers"),
         (evaluation, ["--peers", "nobody"], "nobody"),
         (far_away, ["--modes", "async,nobody"], "nobody"),
+        (growth, ["--sessions", "few"], "few"),
+        (growth, ["--transport", "handle"], "handle"),
         (hop, ["--python", "nowhere"], "nowhere"),
         (report, ["--page", "nowhere.md"], "nowhere.md"),
         (policy, ["noop", "--batch", "0"], "from 1"),
         (policy, ["noop", "--state", "joints=some"], "joints"),
         (policy, ["noop", "--set", "colour=blue"], "colour"),
         (policy, ["nowhere.yaml"], "nowhere.yaml"),
+        (rollouts, ["--envs", "15"], "multiples of the 2 workers"),
         (rtt, ["--peers", "nobody"], "nobody"),
         (rtt, ["--transports", "smoke"], "smoke"),
         (scaling, ["--workers", "2,4"], "from 1 on"),
@@ -35,6 +51,7 @@ from benchmarks.checkpoints import __main__ as checkpoints
         (success, ["--only", "again;faster"], "faster"),
         (throughput, ["--clients", "few"], "few"),
         (throughput, ["--set", "base_ms=1"], "--policy"),
+        (throughput, ["--peers", "openpi", "--policy", "scripted"], "noop"),
     ],
 )
 def test_mistakes_are_reported_in_a_line(module: ModuleType, words: list[str], text: str) -> None:

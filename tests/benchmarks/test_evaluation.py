@@ -3,18 +3,20 @@
 from __future__ import annotations
 
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 from peer_environment import peers_python
 
-from benchmarks.environments import TIMED_TABLETOP, EpisodeTimes, read_episode_times
+from benchmarks.environments import TIMED_ENV, EpisodeTimes, read_episode_times
 from benchmarks.evaluation import (
     SPLIT,
     EvaluationPlan,
     Played,
     alone,
+    our_run,
     play,
     ratios,
     their_runs,
@@ -30,7 +32,7 @@ FEW = EvaluationPlan(episodes=4, workers=2, size=32, max_steps=3)
 
 
 def play_here(notes: Path, seeds: range, steps: int = FEW.max_steps) -> None:
-    with make_env(TIMED_TABLETOP, **FEW.env(notes) | {"max_steps": steps}) as env:
+    with make_env(TIMED_ENV, **FEW.env(notes) | {"max_steps": steps}) as env:
         for seed in seeds:
             env.reset(seed=seed)
             while not env.step(Act(np.zeros(4, np.float32)))[3]:
@@ -38,8 +40,8 @@ def play_here(notes: Path, seeds: range, steps: int = FEW.max_steps) -> None:
 
 
 def test_the_noted_tabletop_is_the_tabletop(tmp_path: Path) -> None:
-    with make_env(TIMED_TABLETOP, **FEW.env(tmp_path)) as noted, make_env("tabletop", width=32, height=32) as plain:
-        assert noted.contract == plain.contract == known_contract(TIMED_TABLETOP, FEW.env(tmp_path))
+    with make_env(TIMED_ENV, **FEW.env(tmp_path)) as noted, make_env("tabletop", width=32, height=32) as plain:
+        assert noted.contract == plain.contract == known_contract(TIMED_ENV, FEW.env(tmp_path))
         ours, theirs = noted.reset(seed=5)[0], plain.reset(seed=5)[0]
         assert np.array_equal(ours.cameras["front"], theirs.cameras["front"])
 
@@ -58,7 +60,7 @@ def test_a_slow_simulator_is_cpu_time(tmp_path: Path) -> None:
     """Not the clock's: that runs on while another process has the core."""
     import time
 
-    with make_env(TIMED_TABLETOP, **FEW.env(tmp_path) | {"step_ms": 20.0}) as env:
+    with make_env(TIMED_ENV, **FEW.env(tmp_path) | {"step_ms": 20.0}) as env:
         env.reset(seed=0)
         used = time.thread_time()
         env.step(Act(np.zeros(4, np.float32)))
@@ -84,6 +86,13 @@ def test_ours_says_how_busy_both_sides_were(tmp_path: Path) -> None:
 
     played = play(FEW, run, tmp_path / "fake")
     assert (played.env_busy, played.policy_busy) == (0.75, 0.5)
+
+
+def test_ours_without_workers_plays_the_plan_soon_after_its_start(tmp_path: Path) -> None:
+    alone_here = replace(FEW, workers=0)
+    played = play(alone_here, our_run(alone_here), tmp_path / "here")
+    assert played.first_s is not None
+    assert 0 < played.first_s < played.wall_s
 
 
 @pytest.mark.parametrize(("seeds", "steps"), [(range(3), 3), (range(1, 5), 3), (range(4), 2)])

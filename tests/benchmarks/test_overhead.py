@@ -8,7 +8,8 @@ import time
 
 import pytest
 
-from benchmarks.overhead import CpuSampler, Span, cpu_seconds, measure_overhead, steady
+from benchmarks.overhead import CpuSampler, Span, measure_overhead, steady
+from benchmarks.processes import cpu_seconds
 from vlagents_ray.errors import EnvFailed
 
 

@@ -12,7 +12,8 @@ from benchmarks.drivers import Driver
 from benchmarks.figures import RoundTrips, lost_db, measured_on, median_interval, median_ratio, ratios
 from benchmarks.hop import CHILD, IN_PROCESS, measure_hop
 from benchmarks.own_clients import OWN_CLIENTS, connect, observation, own_clients
-from benchmarks.round_trips import ROUND, in_turns
+from benchmarks.processes import DAEMONS
+from benchmarks.round_trips import ROUND, in_turns, measure
 from vlagents_ray.errors import ConfigError
 from vlagents_ray.images.jpeg_png import encode_jpeg
 
@@ -44,6 +45,23 @@ def test_all_take_turns_in_short_rounds_and_nobody_is_always_the_first() -> None
     assert [sorted(log[i : i + 3]) for i in (0, 3, 6)] == [["a", "b", "c"]] * 3
     assert len(set(log[::3])) > 1
     assert in_turns(drivers, 10, lambda _: None)["a"].rounds.shape == (1, 10)
+
+
+@pytest.mark.slow
+@pytest.mark.integration
+@pytest.mark.server
+@pytest.mark.alone
+def test_what_an_act_uses_is_counted_by_client_and_server() -> None:
+    ways, _ = own_clients(["shm", "http"])
+    found = measure(ways, 300, lambda _: None).to_json()["use"]
+    assert set(found) == {way.name for way in ways}
+    for way in ways:
+        client, server = (found[way.name][part] for part in ("client", "server"))
+        assert client["cpu_ms"] > 0
+        assert server["programs"]["ServeReplica"] > 0
+        assert server["cpu_ms"] == pytest.approx(sum(server["programs"].values()))
+        assert not DAEMONS & set(server["programs"])
+    assert found["http, jpeg"]["server"]["cpu_ms"] > found["shm"]["server"]["cpu_ms"]
 
 
 def test_ways_have_names_of_their_own() -> None:

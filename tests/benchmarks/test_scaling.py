@@ -10,10 +10,12 @@ import numpy as np
 import pytest
 
 from benchmarks.environments import SLEEPING_ENV, EpisodeTimes, SleepingEnv
+from benchmarks.saturation import Load, parts
 from benchmarks.scaling import CHUNKS, OWN, SHARED, ScalingPlan, fit, row, saturation
 from benchmarks.scaling_driver import DAEMONS, PlayedEpisodes, ScalingRound, daemons_s
 from benchmarks.soak import SoakPlan, gaps, growth, is_worker, measure_soak, resident, soak_outcomes
 from vlagents_ray.envs import make_env
+from vlagents_ray.errors import ConfigError
 from vlagents_ray.interface import Act
 from vlagents_ray.testing import check_env
 
@@ -40,6 +42,13 @@ def test_linear_is_so_many_times_the_single_worker_of_the_same_round() -> None:
     assert found["episodes_per_minute"] == 40
     assert found["driver_share"] == pytest.approx(0.02)
     assert found["daemon_shares"] == pytest.approx(dict.fromkeys(DAEMONS, 0.01))
+    assert (found["near"], found["sent_bytes_per_act"]) == (1, None)
+
+
+def test_bytes_between_hosts_are_those_of_an_act() -> None:
+    rounds = [played(10, sent_bytes=sent, acts=100, near=near) for sent, near in ((1000, 1), (3000, 0.5), (9000, 1))]
+    found = row(PLAN, OWN, 4, rounds, [10] * 3)
+    assert (found["near"], found["sent_bytes_per_act"]) == (0.5, 30)
 
 
 def test_the_ideal_is_what_sleeping_alone_allows() -> None:
@@ -77,6 +86,42 @@ def test_a_driver_is_saturated_when_its_second_is_full() -> None:
     costs = {"episode": 2.0, "step": 0.01, "worker_second": 0.5, "second": 100.0}
     assert saturation(costs, 2.0, 100) == pytest.approx(900 / (3.0 / 2 + 0.5))
     assert saturation(costs, 1e9, 0) == pytest.approx(1800)
+
+
+def of_workers(workers: int, gcs: float) -> dict[str, object]:
+    shares = {"gcs_server": gcs, "raylet": 0.1, "ServeController": 0.04}
+    return {"app": OWN, "workers": workers, "daemon_shares": shares, "sent_bytes_per_act": 1000.0}
+
+
+SCALING = {
+    "clusters": [{"nodes": 2, "rows": [of_workers(1, 0.02), of_workers(11, 0.03)]}],
+    "driver": {
+        "costs_ms": {"episode": 2.9, "step": 0.001, "worker_second": 1.0, "second": 10.0},
+        "flooded": {"episodes_per_s": 200.0},
+    },
+}
+
+
+def test_the_part_with_the_least_room_saturates_first() -> None:
+    load = Load(workers=1000, steps=100, episode_s=30.0, chunk=10, act_ms=60.0, batch=10, replicas=2, mbit=100.0)
+    rows = parts(SCALING, load)
+    found = {row["name"]: row["saturates"] for row in rows}
+    assert next(iter(found)) == "learner's link"
+    # 250 of the workers are queried each second: 10 + 250 ms; an episode takes 3 ms every 30 s.
+    assert found["driver"] == pytest.approx(740 / 0.1)
+    assert found["database"] == pytest.approx(200 * 30)
+    assert found["replicas"] == pytest.approx(20 / 0.06 * 3)  # of an act every 3 s
+    assert found["gcs_server"] == pytest.approx(1 + 0.98 / 0.001)
+    assert found["ServeController"] is None or found["ServeController"] > 1e9
+    assert found["head's link"] == pytest.approx(100e6 / 8 / 1000 * 3)
+    limits = [row["saturates"] or float("inf") for row in rows]
+    assert limits == sorted(limits)
+
+
+def test_figures_of_one_number_of_workers_make_no_line() -> None:
+    one = {**SCALING, "clusters": [{"nodes": 1, "rows": [of_workers(1, 0.02)]}]}
+    with pytest.raises(ConfigError, match="--workers 1,16"):
+        parts(one, Load())
 
 
 def test_daemons_of_this_machine_are_found_by_their_names() -> None:

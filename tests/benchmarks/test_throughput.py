@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 import math
+import time
 from pathlib import Path
 
 import pytest
 
 from benchmarks.autoscaling import AutoscalingPlan, LoadPhase, ScaleSample, by_second, plot_autoscaling, report
 from benchmarks.bare_policy import BarePolicy
+from benchmarks.closed_loop import ClosedLoop
+from benchmarks.figures import mean_interval
 from benchmarks.push import measure_push
-from benchmarks.rollouts import main
+from benchmarks.rollouts import LOCAL, OURS, RolloutComparison, compare_rollouts, rollout_outcomes
 from benchmarks.throughput import ThroughputPlan
 from vlagents_ray.bench.measured_policy import rate_of
 
@@ -38,6 +41,31 @@ def test_the_rate_of_batches_does_not_depend_on_where_the_time_begins(cut: float
 def test_too_few_calls_have_no_rate() -> None:
     assert rate_of([]) == 0
     assert rate_of([[(1.0, 1.0, 1.0, 1)]]) == 0
+
+
+def test_robots_think_and_a_late_answer_ends_a_client() -> None:
+    def prompt() -> tuple[float, float, int]:
+        time.sleep(0.001)
+        return 3.0, 1.0, 4
+
+    def late() -> tuple[float, float, int]:
+        time.sleep(0.3)
+        raise TimeoutError
+
+    loop = ClosedLoop([prompt, prompt, late], robots=1)
+    begin = time.monotonic()
+    robot, simulation, ended = loop.run(1, 2, begin, begin + 0.2)
+    assert 0 < len(robot) < len(simulation)
+    assert {call[1:] for call in simulation} == {(3.0, 1.0, 4)}
+    assert ended == []
+    with pytest.raises(TimeoutError):
+        loop.run(0, 2, begin, time.monotonic() + 1)
+    loop.close()
+
+
+def test_the_interval_of_a_mean_is_students() -> None:
+    assert mean_interval([1.0]) is None
+    assert mean_interval([9.0, 10.0, 11.0]) == pytest.approx((10 - 4.303 / 3**0.5, 10 + 4.303 / 3**0.5))
 
 
 def test_a_bare_policy_is_run_in_full_batches() -> None:
@@ -90,8 +118,22 @@ def test_the_sessions_act_on_with_the_weights_of_each_push() -> None:
 @pytest.mark.slow
 @pytest.mark.integration
 @pytest.mark.server
-def test_it_measures_both(capsys: pytest.CaptureFixture[str]) -> None:
-    main("tiny", workers=2, num_envs=2, episodes=8, rounds=1, size=32)
-    loop, median = capsys.readouterr().out.splitlines()[-2:]
-    assert loop.startswith("loop ")
-    assert median.startswith("median ")
+def test_rollouts_and_the_loop_play_in_turns() -> None:
+    found = compare_rollouts(RolloutComparison(("tiny",), (1, 4), episodes=8, rounds=1, size=32))
+    one, four = found["rows"]
+    assert (one["workers"], four["workers"]) == (1, 2)
+    assert set(one["of_loop"]) == {OURS, LOCAL}
+    assert set(four["of_loop"]) == {OURS}
+    assert all(rate > 0 for row in found["rows"] for rate in row["rounds"][0].values())
+    assert len(rollout_outcomes(found)) == 2
+
+
+def test_a_slow_policy_wants_the_whole_rate_of_the_loop() -> None:
+    rows = [{"policy": policy, "envs": 16, "of_loop": {OURS: 0.95}} for policy in ("tiny", "slow")]
+    assert [one.met for one in rollout_outcomes({"rows": rows})] == [True, False]
+
+
+def test_each_environment_plays_as_many_episodes() -> None:
+    plan = RolloutComparison(episodes=20)
+    assert [plan.turn("tiny", envs) for envs in (1, 16, 64)] == [20, 32, 64]
+    assert plan.turn("slow", 1) == 5

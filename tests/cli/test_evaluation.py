@@ -20,7 +20,6 @@ from typer.testing import CliRunner
 
 from vlagents_ray.cli import evaluate as command
 from vlagents_ray.cli import evaluation as run
-from vlagents_ray.cli import policies
 from vlagents_ray.cli.evaluation import forecasts, live_address, print_plan
 from vlagents_ray.cli.main import app
 from vlagents_ray.evaluate import EvalConfig, OutOfTime, PolicyConfig, Results, SuiteConfig, WorkerConfig
@@ -43,7 +42,9 @@ def said(*words: str) -> str:
 
 @pytest.fixture
 def no_server(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(policies, "running_server", lambda *_, **__: pytest.fail("started a server"))
+    monkeypatch.setattr(
+        "vlagents_ray.serve.launch.server.running_server", lambda *_, **__: pytest.fail("started a server")
+    )
 
 
 def test_a_zero_is_a_number_of_retries_steps_and_seconds(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
@@ -81,7 +82,7 @@ def test_out_of_time_has_an_exit_status_of_its_own(monkeypatch: pytest.MonkeyPat
 
     monkeypatch.setattr(run, "evaluate", evaluate)
     monkeypatch.setattr(run, "print_summary", lambda *_: None)
-    monkeypatch.setattr(run, "served", lambda config, *_, **__: contextlib.nullcontext(config))
+    monkeypatch.setattr(run, "served", lambda config, *_, **__: contextlib.nullcontext((config, {})))
     words = [*WORDS, "--out", str(tmp_path / "out"), "--end-at", "2027-01-31T18:30+00:00"]
     done = CliRunner().invoke(app, words, env={"COLUMNS": "200"})
     assert done.exit_code == 75, done.output
@@ -128,7 +129,7 @@ def end_of(config: EvalConfig, monkeypatch: pytest.MonkeyPatch) -> tuple[int, st
     summary = summarize(Results.load(config.out))
     monkeypatch.setattr(run, "evaluate", lambda *_args, **_options: summary)
     monkeypatch.setattr(command, "config_from_options", lambda *_: config)
-    monkeypatch.setattr(run, "served", lambda config, *_, **__: contextlib.nullcontext(config))
+    monkeypatch.setattr(run, "served", lambda config, *_, **__: contextlib.nullcontext((config, {})))
     done = CliRunner().invoke(app, [*WORDS, "--out", str(config.out)], env={"COLUMNS": "200"})
     assert "Traceback" not in done.output
     return done.exit_code, " ".join(done.stderr.split())

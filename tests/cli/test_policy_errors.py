@@ -24,7 +24,6 @@ from vlagents_ray.errors import ConfigError
 from vlagents_ray.evaluate.episode.episode import run_episodes
 from vlagents_ray.evaluate.episode.records import EpisodeResult
 from vlagents_ray.evaluate.plan.jobs import EpisodeKey
-from vlagents_ray.evaluate.run import evaluate
 from vlagents_ray.interface import Act, Agent, Obs
 
 
@@ -49,11 +48,9 @@ class Failing(ToZero):
 
 def eval_of(out: Path, agent: functools.partial[Agent], monkeypatch: pytest.MonkeyPatch, **settings: Any) -> Result:
     """Run the command in this process."""
-    config = flat_config(**{"envs": [LINE], "episodes": 4, "out": out, "video": "none", **settings})
-    played = functools.partial(evaluate, agent_factory=agent, in_process=True)
-    monkeypatch.setattr(run, "evaluate", played)
+    config = flat_config(**{"envs": [LINE], "episodes": 4, "out": out, "video": "none", "workers": 0, **settings})
     monkeypatch.setattr(command, "config_from_options", lambda *_: config)
-    monkeypatch.setattr(run, "served", lambda config, *_, **__: contextlib.nullcontext(config))
+    monkeypatch.setattr(run, "served", lambda *_, **__: contextlib.nullcontext((config, {"policy": agent})))
     return CliRunner().invoke(app, ["eval", LINE, "--policy", "http://127.0.0.1:9"], env={"COLUMNS": "300"})
 
 

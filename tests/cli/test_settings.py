@@ -41,7 +41,7 @@ class MyEnv(Tabletop):
 """
 RUNS: dict[str, dict[str, object]] = {
     "typo": {"worker": 2},
-    "low": {"workers": 0},
+    "low": {"workers": -1},
     "listed": {"suites": [{"envs": ["tabletop"], "episods": 3}]},
 }
 # What the console script does, whose first entry of `sys.path` is its own folder and not the working directory.
@@ -113,7 +113,7 @@ EVAL = ("--out", "runs/x", "--policy")
         (("eval", "tabletop", "--out", "runs/x"), "error got no --policy, want --policy; or a file of runs"),
         (("eval", "absent.yaml"), "'absent.yaml' does not exist"),
         (("eval", "typo.yaml"), "worker: got 2, want a mapping with some of .'cpus', .*did you mean 'workers'"),
-        (("eval", "low.yaml"), "workers: got 0, want greater than 0"),
+        (("eval", "low.yaml"), "workers: got -1, want greater than or equal to 0"),
         (("eval", "listed.yaml"), "suites.0.episods: there is no such setting; .*did you mean 'episodes'"),
         (("serve", "my_policies:Loaded"), "policy Loaded: checkpoint: is missing; give --set checkpoint=…"),
         (("serve", "my_policies:Reach", "--set", "gain"), "got 'gain', want KEY=VALUE"),
@@ -146,7 +146,9 @@ def test_a_family_whose_packages_are_missing_is_said_before_anything_starts_or_i
 ) -> None:
     monkeypatch.chdir(folder)
     monkeypatch.setitem(POLICIES, "lerobot", replace(POLICIES["lerobot"], needs=("no_such_package",)))
-    monkeypatch.setattr(policies, "running_server", lambda *_, **__: pytest.fail("a server was started"))
+    monkeypatch.setattr(
+        "vlagents_ray.serve.launch.server.running_server", lambda *_, **__: pytest.fail("a server was started")
+    )
     done = CliRunner().invoke(app, words)
     assert "policy 'lerobot': not in this environment (no_such_package): `vlagents-ray env make " in done.stderr
     assert done.exit_code == 1

@@ -55,7 +55,7 @@ def test_an_episode_lost_in_any_round_ends_watching_with_status_1_and_no_round_e
     config = EvalConfig.model_validate({"policies": [SWEPT], "suites": [{"envs": [LINE]}], "out": tmp_path / "o"})
     played: list[list[int]] = []
 
-    def play(config: EvalConfig, _progress: Progress) -> Summary:
+    def play(config: EvalConfig, _progress: Progress, **_: Any) -> Summary:
         played.append(config.policies[0].steps)
         with Store(config) as store:
             store.begin_run(config, {})
@@ -67,10 +67,9 @@ def test_an_episode_lost_in_any_round_ends_watching_with_status_1_and_no_round_e
 
     monkeypatch.setattr(run, "evaluate_and_print", play)
     monkeypatch.setattr(run, "rounds", lambda *_: iter([[10], [20, 30]]))
-    monkeypatch.setattr(run, "served", lambda config, *_: contextlib.nullcontext(config))
-    monkeypatch.setattr(run, "ray_cluster", lambda _config: contextlib.nullcontext())
+    monkeypatch.setattr(run, "served", lambda config, *_: contextlib.nullcontext((config, {})))
     with pytest.raises(typer.Exit) as ended:
-        watch_training(config, tmp_path)
+        watch_training(config.model_copy(update={"workers": 0}), tmp_path)
     assert played == [[10], [20, 30]]
     assert ended.value.exit_code == 1
 

@@ -27,7 +27,7 @@ from vlagents_ray.evaluate import EvalConfig
 from vlagents_ray.serve.access.api_keys import FILE_VARIABLE
 from vlagents_ray.serve.access.key_store import new_key
 from vlagents_ray.serve.config.deployment import ServerArgs
-from vlagents_ray.serve.launch.deployment_file import listens_at, read_deployment
+from vlagents_ray.serve.launch.deployment_file import read_deployment
 from vlagents_ray.serve.launch.haproxy import ROBOTS
 
 pytestmark = pytest.mark.integration
@@ -116,7 +116,7 @@ def test_the_embedded_deployment_is_one_that_serve_takes(tmp_path: Path) -> None
         for port in SERVICE.cluster.head_group_spec.template["spec"]["containers"][0]["ports"]
         if port["name"] == "serve"
     ]
-    assert listens_at(config) == ("0.0.0.0", port)  # noqa: S104 - a pod's
+    assert (config.http_options.host, config.http_options.port) == ("0.0.0.0", port)  # noqa: S104 - a pod's
     [application] = config.applications
     args = ServerArgs(**application.args)
     assert args.autoscaling is not None

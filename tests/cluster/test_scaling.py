@@ -13,7 +13,7 @@ from eval_fakes import PYTHONPATH
 
 from benchmarks.environments import SLEEPING_ENV
 from benchmarks.hosts import hosts, ray_cluster
-from benchmarks.scaling import OWN, ScalingPlan, driving, measure_cluster
+from benchmarks.scaling import IMAGE_BYTES, OWN, ScalingPlan, driving, measure_cluster
 from benchmarks.scaling_driver import Fleet, PlayedEpisodes, ScalingRound
 from vlagents_ray.bench.line_process import LineProcess, our_environment
 from vlagents_ray.evaluate import Results
@@ -42,10 +42,10 @@ evaluate(EvalConfig(
 def test_four_workers_on_two_nodes_play_nearly_four_times_as_much_as_one() -> None:
     """Anything that all wait for would halve it; the bound leaves room for a machine that has other work to do."""
     plan = ScalingPlan(workers=(1, 4), rounds=1, steps=20, seconds=3.0)
-    with driving(plan, nodes=2) as (driver, size):
+    with driving(plan, nodes=2) as (driver, size, made):
         assert size == 2
         for _ in range(3):  # a machine that stands still for a second spoils a round
-            rows = {(row["app"], row["workers"]): row for row in measure_cluster(plan, size, driver)["rows"]}
+            rows = {(row["app"], row["workers"]): row for row in measure_cluster(plan, size, driver, made=made)["rows"]}
             if rows[OWN, 4]["of_linear"] > 0.6:
                 break
         # Over before the last worker is there, as with the rounds that tell the driver's costs.
@@ -58,6 +58,8 @@ def test_four_workers_on_two_nodes_play_nearly_four_times_as_much_as_one() -> No
     assert own["of_ideal"] <= 1.01
     assert own["failures"] == 0
     assert own["transports"] == ["shm"], "a replica for each worker of a node is on that node"
+    assert own["near"] == 1
+    assert own["sent_bytes_per_act"] < IMAGE_BYTES / 10, "no image leaves its host"
 
 
 def test_two_drivers_on_one_cluster_play_a_part_each_and_their_results_are_merged(tmp_path: Path) -> None:

@@ -55,11 +55,11 @@ class SlowAfterTwo(Progress):
 def test_out_of_time_keeps_what_is_finished_and_resume_plays_the_rest(
     config: Callable[..., EvalConfig], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    play = functools.partial(evaluate, agent_factory=ToZero, in_process=True)
+    play = functools.partial(evaluate, agent_factory=ToZero)
     with pytest.raises(OutOfTime) as stopped:
-        play(config(), end_at=time.time() - 1)
+        play(config(workers=0), end_at=time.time() - 1)
     assert stopped.value.summary.total.episodes == 0
-    again = config(resume=True)
+    again = config(workers=0, resume=True)
     with monkeypatch.context() as patch, pytest.raises(OutOfTime, match=r"out of time after .* --resume") as stopped:
         play(again, progress=SlowAfterTwo(patch), end_at=time.time() + 1000)
     assert stopped.value.summary.total.episodes == 2

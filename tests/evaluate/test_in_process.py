@@ -16,13 +16,14 @@ from typing import Any
 
 import pytest
 from eval_fakes import DRIFTING_LINE, LINE, OTHER_LINE, ToZero
-from in_process_evaluation import without_ray
+from in_process_evaluation import flat_config
 
 from vlagents_ray.errors import ClusterLost, ConfigError, EnvFailed
 from vlagents_ray.evaluate import EvalConfig, EvaluationInterrupted, Summary, evaluate, run
 from vlagents_ray.evaluate.episode.failures import Failure
 from vlagents_ray.evaluate.plan.jobs import Job
-from vlagents_ray.evaluate.workers.pool import InProcessWorkers
+from vlagents_ray.evaluate.workers import base, in_process
+from vlagents_ray.evaluate.workers.in_process import InProcessWorkers
 from vlagents_ray.evaluate.workers.rollout import Report
 
 Config = Callable[..., EvalConfig]
@@ -35,14 +36,14 @@ def outcomes(summary: Summary) -> list[dict[str, Any]]:
 def test_its_episodes_are_those_of_workers(config: Config, tmp_path: Path, shared_ray: None) -> None:
     envs = {"envs": [LINE, OTHER_LINE]}
     usual = evaluate(config(**envs, out=tmp_path / "usual"), agent_factory=ToZero)
-    here = evaluate(config(**envs), agent_factory=ToZero, in_process=True)
+    here = evaluate(config(**envs, workers=0), agent_factory=ToZero)
     assert outcomes(here) == outcomes(usual)
     assert {worker.pid for worker in here.results.workers} == {os.getpid()}
     assert os.getpid() not in {worker.pid for worker in usual.results.workers}
 
 
-def test_it_is_one_worker_without_ray_whatever_the_plan_says(config: Config) -> None:
-    summary = evaluate(config(workers=4), agent_factory=ToZero, in_process=True)
+def test_it_is_one_worker_without_ray(config: Config) -> None:
+    summary = evaluate(config(workers=0), agent_factory=ToZero)
     assert (summary.state, summary.total.episodes) == ("complete", 6)
     assert [worker.pid for worker in summary.results.workers] == [os.getpid()]
     assert json.loads((summary.out / "summary.json").read_text()) == json.loads(json.dumps(summary.to_json()))
@@ -51,11 +52,37 @@ def test_it_is_one_worker_without_ray_whatever_the_plan_says(config: Config) -> 
     assert f"{100 * rate:.1f} %" in (summary.out / "report.html").read_text()
 
 
+@pytest.mark.parametrize(
+    ("changes", "workers"),
+    [
+        ({}, 0),
+        ({"workers": 3}, 3),
+        ({"episodes": 33}, 0),
+        ({"episodes": 34}, 1),
+        ({"episodes": 34, "env_options": {"max_steps": 10}}, 0),
+        ({"gpus_per_worker": 0.5}, 1),
+        ({"policy_url": "serve://pi0"}, 1),
+        ({"runtime_env": {"pip": ["einops"]}}, 1),
+    ],
+)
+def test_a_short_evaluation_that_needs_no_ray_has_no_workers(
+    changes: dict[str, Any], workers: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.delenv("RAY_ADDRESS", raising=False)
+    monkeypatch.setattr(base, "node_of_this_process", lambda: None)
+    assert base.chosen_workers(flat_config(envs=[LINE], out="out", **changes)) == workers
+
+
+def test_a_process_in_a_cluster_plays_there(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("RAY_ADDRESS", "10.0.0.1:6379")
+    assert base.chosen_workers(flat_config(envs=[LINE], out="out")) == 1
+
+
 def test_a_simulator_that_does_not_repeat_itself_leaves_one_failure_without_a_video_and_a_warning(
     config: Config, caplog: pytest.LogCaptureFixture
 ) -> None:
-    settings = config(envs=[DRIFTING_LINE], env_options={"camera": [32, 32]}, episodes=12, video="failures")
-    summary = evaluate(settings, agent_factory=lambda: ToZero(3), in_process=True)
+    settings = config(envs=[DRIFTING_LINE], env_options={"camera": [32, 32]}, episodes=12, video="failures", workers=0)
+    summary = evaluate(settings, agent_factory=lambda: ToZero(3))
     failed = [one for cell in summary.results.cells for one in cell.episodes if not one.result.success_once]
     bare = [str(one.result.key) for one in failed if not one.videos]
     warnings = [record.getMessage() for record in caplog.records if "nothing of it is recorded" in record.getMessage()]
@@ -66,32 +93,34 @@ def test_a_simulator_that_does_not_repeat_itself_leaves_one_failure_without_a_vi
 
 
 def test_it_goes_on_with_what_has_no_result(config: Config) -> None:
-    evaluate(config(), agent_factory=ToZero, in_process=True, only=(2, 2))
+    evaluate(config(workers=0), agent_factory=ToZero, only=(2, 2))
     with pytest.raises(ConfigError, match="already has results"):
-        evaluate(config(), agent_factory=ToZero, in_process=True)
-    summary = evaluate(config(resume=True), agent_factory=ToZero, in_process=True)
+        evaluate(config(workers=0), agent_factory=ToZero)
+    summary = evaluate(config(workers=0, resume=True), agent_factory=ToZero)
     assert [one.run for cell in summary.results.cells for one in cell.episodes] == [2, 2, 1, 2, 2, 2]
 
 
 def test_a_simulator_that_breaks_is_made_again_and_its_episode_repeated(config: Config, tmp_path: Path) -> None:
     trouble = {"folder": str(tmp_path), "trouble": {"raise": [2]}}
-    summary = evaluate(config(env_options=trouble), agent_factory=ToZero, in_process=True)
+    summary = evaluate(config(env_options=trouble, workers=0), agent_factory=ToZero)
     with closing(sqlite3.connect(summary.out / "results.db")) as db:
         assert db.execute("SELECT episode FROM episodes WHERE attempts = 2").fetchall() == [(2,)]
     assert len(summary.results.workers) == 2, "one for each simulator"
-    whole = evaluate(config(out=tmp_path / "whole"), agent_factory=ToZero, in_process=True)
+    whole = evaluate(config(out=tmp_path / "whole", workers=0), agent_factory=ToZero)
     assert [one | {"key": 0} for one in outcomes(summary)] == [one | {"key": 0} for one in outcomes(whole)]
 
 
 def test_suites_whose_workers_differ_have_their_turns(config: Config) -> None:
     [suite] = config(episodes=2).suites
     other = suite.model_copy(update={"envs": [OTHER_LINE], "worker": config(cpus_per_worker=2.0).worker})
-    both = config().model_copy(update={"suites": [suite, other]})
-    assert evaluate(both, agent_factory=ToZero, in_process=True).total.episodes == 4
+    both = config(workers=0).model_copy(update={"suites": [suite, other]})
+    assert evaluate(both, agent_factory=ToZero).total.episodes == 4
 
 
 @pytest.mark.parametrize("cluster_is_lost", [False, True])
-def test_what_a_signal_to_the_whole_group_ends_first_costs_no_attempt(config: Config, cluster_is_lost: bool) -> None:
+def test_what_a_signal_to_the_whole_group_ends_first_costs_no_attempt(
+    config: Config, cluster_is_lost: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
     class EndedFirst(InProcessWorkers):
         def wait(self, timeout_s: float) -> Iterator[tuple[Job, Report]]:
             waiting = [job for one in self._workers for job in one.jobs]
@@ -103,8 +132,9 @@ def test_what_a_signal_to_the_whole_group_ends_first_costs_no_attempt(config: Co
                 reports = [(job, Report(failure=Failure("worker", EnvFailed.code, "killed"))) for job in waiting]
             yield from reports
 
-    with without_ray(pool=EndedFirst), pytest.raises(EvaluationInterrupted) as stopped:
-        evaluate(config(), agent_factory=ToZero)
+    monkeypatch.setattr(in_process, "InProcessWorkers", EndedFirst)
+    with pytest.raises(EvaluationInterrupted) as stopped:
+        evaluate(config(workers=0), agent_factory=ToZero)
     assert stopped.value.summary.total.episodes == 2
     with closing(sqlite3.connect(config().out / "results.db")) as db:
         assert db.execute("SELECT count(*) FROM attempts").fetchone() == (0,)
@@ -130,8 +160,8 @@ def test_failures_that_come_together_wait_for_a_signal_once(config: Config, monk
 
     monkeypatch.setattr(threading.Event, "wait", waited)
     monkeypatch.setattr(run, "SIGNAL_S", 0.0123)
-    with without_ray(pool=FailsOnce):
-        summary = evaluate(config(workers=3), agent_factory=ToZero)
+    monkeypatch.setattr(in_process, "InProcessWorkers", FailsOnce)
+    summary = evaluate(config(workers=0), agent_factory=ToZero)
     assert summary.total.episodes == 6
     with closing(sqlite3.connect(summary.out / "results.db")) as db:
         assert db.execute("SELECT count(*) FROM attempts").fetchone() == (3,)
@@ -149,7 +179,7 @@ print(sum(len(cell.episodes) for cell in results.cells))
 
 
 def test_results_are_read_without_ray(config: Callable[..., EvalConfig]) -> None:
-    summary = evaluate(config(), agent_factory=ToZero, in_process=True)
+    summary = evaluate(config(workers=0), agent_factory=ToZero)
     command = [sys.executable, "-W", "error", "-c", READ, str(summary.out)]
     told = subprocess.run(command, check=False, capture_output=True, text=True, timeout=60)
     assert told.returncode == 0, told.stderr

@@ -46,7 +46,7 @@ def impatient(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def here(settings: EvalConfig, make: Callable[[], Agent] = ToZero) -> Summary:
     """Evaluate in this process."""
-    return evaluate(settings, agent_factory=make, in_process=True)
+    return evaluate(settings.model_copy(update={"workers": 0}), agent_factory=make)
 
 
 @pytest.mark.usefixtures("shared_ray")
@@ -99,7 +99,7 @@ class TestOnACluster:
                 yield
                 found.append(json.loads((settings.out / "summary.json").read_text())["state"])
 
-        monkeypatch.setattr("vlagents_ray.evaluate.run.ray_cluster", looking)
+        monkeypatch.setattr("vlagents_ray.evaluate.workers.cluster.ray_cluster", looking)
 
         class SignalAfterTwo(Progress):
             seen = 0

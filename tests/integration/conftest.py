@@ -7,17 +7,14 @@ import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import pytest
 from ray_processes import processes, ray_folder
 from shared_ray import shared_server
 
-from vlagents_ray.serve.launch.deployment_file import deployment
+from vlagents_ray.serve.launch.deployment_file import Deployment, deployment
 from vlagents_ray.serve.launch.server import Server
-
-if TYPE_CHECKING:
-    from ray.serve.schema import ServeDeploySchema
 
 SUPPORT = Path(__file__).parent.parent / "support"
 
@@ -48,13 +45,13 @@ def ray_home() -> Iterator[Path]:
         assert not processes(folder), "left running"
 
 
-def deploy(config: ServeDeploySchema) -> None:
+def deploy(config: Deployment) -> None:
     """Have Serve deploy the file, as `serve deploy` does with one that was changed."""
     from ray.serve.context import _get_global_client
 
     client = _get_global_client()
     assert client is not None
-    client.deploy_apps(config)
+    client.deploy_apps(config.for_serve())
 
 
 def states(app: str) -> dict[str, int]:

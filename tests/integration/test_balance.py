@@ -9,23 +9,22 @@ from concurrent.futures import ThreadPoolExecutor
 
 import pytest
 from eval_fakes import wait_for
-from ray.serve.schema import ServeDeploySchema
 
 from tests.integration.conftest import deploy
 from tests.integration.test_sessions import obs, url
 from vlagents_ray import RemoteAgent
 from vlagents_ray.client.transports.select import TransportName
-from vlagents_ray.serve.launch.deployment_file import deployment
+from vlagents_ray.serve.launch.deployment_file import Deployment, deployment
 from vlagents_ray.serve.launch.server import Server, running_server
 
 HELD: dict[TransportName, int] = {"handle": 2, "shm": 2, "websocket": 6}  # of equal connections the oldest go first
 
 
-def deployed(replicas: int) -> ServeDeploySchema:
+def deployed(replicas: int) -> Deployment:
     """As `serve deploy` with another `num_replicas` would have it."""
     reacher = deployment("served_agents:Reacher").model_dump(exclude_unset=True)
     reacher["applications"][0]["deployments"] = [{"name": "Policy", "num_replicas": replicas}]
-    return ServeDeploySchema(applications=reacher["applications"])
+    return Deployment(applications=reacher["applications"])
 
 
 @pytest.fixture(scope="module")

@@ -9,6 +9,7 @@ import sys
 from pathlib import Path
 
 import pytest
+from peer_environment import peers_python
 
 from benchmarks.own_clients import own_clients
 
@@ -69,3 +70,23 @@ def test_throughput_comes_near_the_bare_policy_and_never_above_it(ray_home: Path
         assert 1 < row["curve"][0]["mean_batch"] <= 4
         assert row["robot"]["calls"] > 0
     assert "of the ideal; a robot among simulations waits" in done.stdout
+
+
+@pytest.mark.slow
+@pytest.mark.integration
+@pytest.mark.alone
+def test_peers_make_load_in_the_same_run(ray_home: Path, tmp_path: Path) -> None:
+    file = tmp_path / "throughput.json"
+    few = ["--clients", "1,2", "--batch", "2", "--seconds", "0.5", "--rounds", "2", "--robot-seconds", "1"]
+    peers = ["--peers", "openpi,portal", "--peers-python", str(peers_python())]
+    done = bench(ray_home, "throughput", *few, *peers, "--transports", "shm", "--json", str(file))
+    assert done.returncode == 0, done.stdout + done.stderr
+    found = json.loads(file.read_text())
+    assert (set(found["transports"]), set(found["peers"])) == ({"shm"}, {"openpi", "portal"})
+    assert found["versions"].keys() >= {"ray", "openpi-client", "portal"}
+    for row in (*found["transports"].values(), *found["peers"].values()):
+        assert [point["clients"] for point in row["curve"]] == [1, 2]
+        assert all(len(point["rounds"]) == 2 and point["ci95"][0] <= point["actions_per_s"] for point in row["curve"])
+        assert row["robot"]["calls"] > 0
+    batches = {name: row["curve"][1]["mean_batch"] for name, row in found["peers"].items()}
+    assert batches == {"openpi": 1.0, "portal": 2.0}

@@ -10,7 +10,6 @@ from typing import Any
 import pytest
 from eval_fakes import wait_for
 from in_process_evaluation import flat_config
-from ray.serve.schema import ServeDeploySchema
 from shared_ray import shared_server
 
 from tests.integration.conftest import deploy, states
@@ -20,7 +19,7 @@ from vlagents_ray.errors import CheckpointFailed, UnknownCheckpoint
 from vlagents_ray.evaluate import evaluate
 from vlagents_ray.evaluate.results.summary import stated
 from vlagents_ray.policies.base.checkpoint_files import digest
-from vlagents_ray.serve.launch.deployment_file import deployment
+from vlagents_ray.serve.launch.deployment_file import Deployment, deployment
 from vlagents_ray.serve.launch.server import Server
 
 POLICY = "served_agents:Stored"
@@ -35,14 +34,14 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def deployed(folder: Path, **beside: Any) -> ServeDeploySchema:
+def deployed(folder: Path, **beside: Any) -> Deployment:
     """As a file says it, with what may change while it runs beside `args`."""
     config = {"checkpoint": str(folder / "{step}"), "checkpoint_step": 1}
     checkpoints = {"choices": {"late": {"checkpoint": str(folder / "9")}}, "steps": True, "loaded": 2}
     document = deployment(POLICY, config=config, checkpoints=checkpoints).model_dump(exclude_unset=True)
     if beside:
         document["applications"][0]["deployments"] = [{"name": "Policy", **beside}]
-    return ServeDeploySchema(**document)
+    return Deployment(**document)
 
 
 @pytest.fixture(scope="module")

@@ -83,6 +83,28 @@ def test_kill_dash_nine_and_resume_leave_each_episode_once(ray_home: Path, tmp_p
     assert set(before) <= set(after)
 
 
+def test_results_without_workers_are_those_with_them_and_each_resumes_the_other(ray_home: Path, tmp_path: Path) -> None:
+    words = ["tabletop", "tabletop/stack", "--policy", "scripted", "--video", "none", "--out"]
+    orders = {"whole": ["0"], "workers": ["2"], "there": ["0", "2"], "back": ["2", "0"]}
+    for name, order in orders.items():
+        for number, workers in enumerate(order):
+            episodes = "4" if number == len(order) - 1 else "2"
+            resume = ["--resume"] * bool(number)
+            done = evaluate(
+                ray_home, *words, str(tmp_path / name), "--episodes", episodes, "--workers", workers, *resume
+            )
+            assert done.returncode == 0, done.stdout + done.stderr
+    found = {}
+    for name in orders:
+        results = Results.load(tmp_path / name)
+        found[name] = [one.result.outcome for cell in results.cells for one in cell.episodes]
+        assert len(found[name]) == 8
+    assert found["whole"] == found["there"] == found["back"]
+    policies = [Results.load(tmp_path / name).policies["scripted"] for name in ("whole", "there")]
+    ours, theirs = ({key: one.get(key) for key in ("policy", "config", "contract", "program")} for one in policies)
+    assert ours == theirs
+
+
 RUNS = """
 policies:
   - {name: expert, source: scripted}

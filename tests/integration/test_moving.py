@@ -13,24 +13,23 @@ from urllib.parse import urlsplit
 import numpy as np
 import pytest
 from eval_fakes import wait_for
-from ray.serve.schema import ServeDeploySchema
 from shared_ray import shared_server
 
 from tests.integration.conftest import deploy, states
 from tests.integration.test_sessions import TRANSPORTS, obs, url
 from vlagents_ray import RemoteAgent
 from vlagents_ray.images.jpeg_png import encode_jpeg
-from vlagents_ray.serve.launch.deployment_file import deployment
+from vlagents_ray.serve.launch.deployment_file import Deployment, deployment
 from vlagents_ray.serve.launch.server import Server
 
 
-def deployed(replicas: int) -> ServeDeploySchema:
+def deployed(replicas: int) -> Deployment:
     """Two policies; `replicas` of the first, as `serve deploy` with another `num_replicas` would have it."""
     reacher = deployment("served_agents:Reacher", replicas=3).model_dump(exclude_unset=True)
     remembering = deployment("served_agents:Remembering", replicas=2).model_dump(exclude_unset=True)
     reacher["applications"][0]["deployments"] = [{"name": "Policy", "num_replicas": replicas}]
     remembering["applications"][0]["route_prefix"] = "/remembering"
-    return ServeDeploySchema(applications=reacher["applications"] + remembering["applications"])
+    return Deployment(applications=reacher["applications"] + remembering["applications"])
 
 
 @pytest.fixture(scope="module")

@@ -52,7 +52,7 @@ def test_a_replica_that_others_would_reach_does_not_start_without_keys() -> None
     with server.own_ray("127.0.0.1", free_port(), num_cpus=2):
         client = serve_start(http_options={"host": EVERYWHERE, "port": free_port(EVERYWHERE)})
         try:
-            client.deploy_apps(deployment("noop"))
+            client.deploy_apps(deployment("noop").for_serve())
             wait_for(lambda: serve.status().applications["noop"].status == "DEPLOY_FAILED")
             (said,) = serve.status().applications["noop"].deployments.values()
             assert "access: {keys_file: PATH}" in said.message

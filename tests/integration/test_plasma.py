@@ -300,7 +300,7 @@ def test_faults_are_answered_and_harm_nobody(agent: RemoteAgent, transport: Plas
         (free, "lease"),
     ):
         connection.send(message)
-        shm._wait(connection, select.POLLIN, time.monotonic() + 60)
+        shm.wait(connection, select.POLLIN, time.monotonic() + 60)
         [reply] = transport._receive(connection)
         error = reply.error
         assert isinstance(error, MalformedMessage)

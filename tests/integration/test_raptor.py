@@ -14,14 +14,13 @@ import psutil
 import pytest
 from eval_fakes import wait_for
 from raptor_flights import TOLERANCE, fly, loaded, observation, reference, together
-from ray.serve.schema import ServeDeploySchema
 from shared_ray import shared_server
 
 from tests.integration.conftest import deploy, states
 from tests.integration.test_sessions import TRANSPORTS
 from vlagents_ray import Act, Agent, ConnectionLost, Obs, RemoteAgent
 from vlagents_ray.client.transports.select import TransportName
-from vlagents_ray.serve.launch.deployment_file import deployment
+from vlagents_ray.serve.launch.deployment_file import Deployment, deployment
 from vlagents_ray.serve.launch.server import Server
 
 FLIGHTS, STEPS = 32, 500
@@ -29,10 +28,10 @@ APP = "LocatedRaptor"
 START = observation(np.zeros(22, np.float32))
 
 
-def deployed(replicas: int) -> ServeDeploySchema:
+def deployed(replicas: int) -> Deployment:
     config = deployment(f"raptor_flights:{APP}", replicas=2, batch={"max_size": FLIGHTS}).model_dump(exclude_unset=True)
     config["applications"][0]["deployments"] = [{"name": "Policy", "num_replicas": replicas}]
-    return ServeDeploySchema(**config)
+    return Deployment(**config)
 
 
 def scale(replicas: int) -> None:

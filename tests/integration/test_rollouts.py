@@ -12,12 +12,11 @@ from typing import Any
 
 import pytest
 from eval_fakes import LINE, wait_for
-from in_process_evaluation import without_ray
 from served_agents import Stochastic
 
 from tests.integration.conftest import serving
 from vlagents_ray.errors import NotOffered
-from vlagents_ray.learn import RolloutPlan, Rollouts, arrays, rollouts
+from vlagents_ray.learn import RolloutPlan, Rollouts, arrays
 from vlagents_ray.serve.launch.server import Server
 
 GROUPS: dict[str, Any] = {"groups": 4, "want": ["logprob", "value"], "seed": 10}
@@ -39,7 +38,7 @@ def served(shared_ray: None, version: Path) -> Iterator[Server]:
 def expected(version: Path) -> Any:
     """The transitions of 8 episodes of the policy in this process, one after the other."""
     write(version, 3)
-    with without_ray(rollouts), Rollouts(RolloutPlan(LINE, partial(Stochastic, str(version)), **GROUPS)) as found:
+    with Rollouts(RolloutPlan(LINE, partial(Stochastic, str(version)), **GROUPS | {"workers": 0})) as found:
         return without_key(found.collect(8))
 
 

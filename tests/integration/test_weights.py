@@ -8,24 +8,23 @@ from concurrent.futures import ThreadPoolExecutor
 import numpy as np
 import pytest
 from eval_fakes import wait_for
-from ray.serve.schema import ServeDeploySchema
 from shared_ray import shared_server
 
 from tests.integration.conftest import deploy, states
 from vlagents_ray import Obs, RemoteAgent
 from vlagents_ray.errors import InvalidWeights, PolicyUnavailable, UnchangedWeights
 from vlagents_ray.learn import Publisher
-from vlagents_ray.serve.launch.deployment_file import deployment
+from vlagents_ray.serve.launch.deployment_file import Deployment, deployment
 from vlagents_ray.serve.launch.server import Server
 
 TRANSPORTS = ("shm", "plasma", "websocket", "http", "handle")
 
 
-def deployed(replicas: int) -> ServeDeploySchema:
+def deployed(replicas: int) -> Deployment:
     """A policy that can be trained."""
     document = deployment("served_agents:Trainable", replicas=2).model_dump(exclude_unset=True)
     document["applications"][0]["deployments"] = [{"name": "Policy", "num_replicas": replicas}]
-    return ServeDeploySchema(**document)
+    return Deployment(**document)
 
 
 @pytest.fixture(scope="module")

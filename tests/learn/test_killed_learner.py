@@ -13,10 +13,9 @@ from typing import Any
 import pyarrow as pa
 import pytest
 from eval_fakes import LINE, PYTHONPATH, ToZero, wait_for
-from in_process_evaluation import without_ray
 from ray_processes import processes, ray_folder, wait_for_end
 
-from vlagents_ray.learn import RolloutPlan, Rollouts, rollouts
+from vlagents_ray.learn import RolloutPlan, Rollouts
 
 pytestmark = [pytest.mark.ray, pytest.mark.slow]
 
@@ -66,7 +65,7 @@ def test_a_killed_learner_leaves_nothing_running_and_goes_on_without_a_lost_or_d
         with Popen(command, env=environment, start_new_session=True) as learner:
             assert learner.wait(300) == 0
         wait_for(lambda: not processes(ours))
-    with without_ray(rollouts), Rollouts(RolloutPlan(LINE, ToZero, env_options=options)) as undisturbed:
+    with Rollouts(RolloutPlan(LINE, ToZero, workers=0, env_options=options)) as undisturbed:
         expected = list(itertools.islice(undisturbed, EPISODES))
     got = learned(tmp_path)
     assert len(got) == EPISODES

@@ -1,13 +1,16 @@
 from __future__ import annotations
 
 import itertools
+import os
+import subprocess
+import sys
 from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
 import pytest
 from eval_fakes import EVERY, LINE, OTHER_LINE, Line, SevenLine, ToZero
-from in_process_evaluation import flat_config, without_ray
+from in_process_evaluation import flat_config
 from in_process_replicas import Replicas
 
 from vlagents_ray.envs.base import BatchEnv, SequentialBatch
@@ -16,7 +19,7 @@ from vlagents_ray.evaluate.episode.failures import Failure
 from vlagents_ray.evaluate.plan.cases import cells
 from vlagents_ray.evaluate.plan.jobs import Job, plan
 from vlagents_ray.evaluate.workers import rollout
-from vlagents_ray.evaluate.workers.pool import InProcessWorkers
+from vlagents_ray.evaluate.workers.in_process import InProcessWorkers
 from vlagents_ray.evaluate.workers.rollout import Report
 from vlagents_ray.interface import Act, Agent, Obs
 from vlagents_ray.learn import RolloutPlan, Rollouts, arrays, rollouts
@@ -52,13 +55,13 @@ class Workers(InProcessWorkers):
 
 
 @pytest.fixture(autouse=True)
-def pool(monkeypatch: pytest.MonkeyPatch) -> Iterator[type[Workers]]:
+def pool(monkeypatch: pytest.MonkeyPatch) -> type[Workers]:
     """Workers in this process."""
     monkeypatch.setattr(Workers, "dying", 0)
     monkeypatch.setattr(Workers, "played", [])
     monkeypatch.setattr(rollout, "FIRST_WAIT_S", 0.001)
-    with without_ray(rollouts, Workers):
-        yield Workers
+    monkeypatch.setattr(rollouts, "workers_class", lambda _config, _stack: Workers)
+    return Workers
 
 
 class Versioned(ToZero):
@@ -105,6 +108,25 @@ def test_collect_plays_so_many_and_no_others(pool: type[Workers]) -> None:
         assert table.num_rows == 50
         assert arrays(table)["state.position"].shape == (50, 1)
         assert list(dict.fromkeys(arrays(found.collect(2))["key"])) == planned(7)[5:]
+
+
+PLAY = """
+import sys
+for name in ("ray", "torch"):
+    sys.modules[name] = None  # as if it were not installed
+from eval_fakes import LINE, ToZero
+from vlagents_ray.learn import RolloutPlan, Rollouts
+with Rollouts(RolloutPlan(LINE, ToZero, workers=0)) as rollouts:
+    print(rollouts.collect(2).num_rows)
+"""
+
+
+def test_without_workers_they_need_no_ray() -> None:
+    environment = os.environ | {"PYTHONPATH": os.pathsep.join(path for path in sys.path if path)}
+    command = [sys.executable, "-W", "error", "-c", PLAY]
+    told = subprocess.run(command, check=False, capture_output=True, text=True, timeout=60, env=environment)
+    assert told.returncode == 0, told.stderr
+    assert told.stdout.strip() == "20"
 
 
 class Replayed(ToZero):

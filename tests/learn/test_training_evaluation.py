@@ -131,8 +131,8 @@ def test_an_agent_of_this_process_has_the_results_of_a_served_one(
         for number, gain in enumerate((0.3, 0.9)):
             agent.tree["gain"][:] = gain
             version = weights.push(agent.parameters())
-            usual = plan_in(tmp_path / f"served {number}", num_envs=num_envs)
-            evaluate(usual, agent_factory=partial(served.agent, rank="simulation"), in_process=True)
+            usual = plan_in(tmp_path / f"served {number}", num_envs=num_envs, workers=0)
+            evaluate(usual, agent_factory=partial(served.agent, rank="simulation"))
             TrainingEvaluation(agent, plan_in(tmp_path / f"here {number}", num_envs=num_envs)).play(version)
             one, other = episodes(usual.out, "reach"), episodes(tmp_path / f"here {number}", f"reach@{version}")
             assert [alike(result) for result in one] == [alike(result) for result in other]
@@ -193,9 +193,9 @@ def test_an_evaluation_that_was_cut_short_goes_on(plan: EvalConfig, agent: Propo
 def test_an_episode_of_other_weights_is_refused(plan: EvalConfig, served: Replicas) -> None:
     wanted = PushedWeights(version=3, fingerprint=fingerprint({"gain": np.ones(1, np.float32)}))
     [policy] = plan.policies
-    config = plan.model_copy(update={"policies": [policy.model_copy(update={"pushed_weights": wanted})]})
+    config = plan.model_copy(update={"policies": [policy.model_copy(update={"pushed_weights": wanted})], "workers": 0})
     with pytest.raises(ConfigError, match=r"was played by versions 0 to 0 of the weights \(\w+\), want 3"):
-        evaluate(config, agent_factory=served.agent, in_process=True)
+        evaluate(config, agent_factory=served.agent)
     assert episodes(plan.out, "reach@3") == []
 
 

@@ -26,10 +26,11 @@ from vlagents_ray.images import jpeg_png
 from vlagents_ray.images.mp4 import Mp4
 from vlagents_ray.interface import Act, Agent, Obs
 from vlagents_ray.open_loop.recorded import Names, RecordedDataset
-from vlagents_ray.open_loop.replay import LocalAgent, ReplayPlan, Sessions, candidate, replay
+from vlagents_ray.open_loop.replay import ReplayPlan, Sessions, candidate, replay
 from vlagents_ray.policies.random import Random
 from vlagents_ray.robot.record import Recorder
 from vlagents_ray.serve.engine.engine import Engine
+from vlagents_ray.serve.local_agent import LocalAgent
 from vlagents_ray.serve.observers import episodes
 
 

@@ -173,9 +173,12 @@ def test_a_quadrotor_obeys_gravity_and_thrust() -> None:
 
 def test_an_evaluation_plays_the_flights(policy: Raptor, tmp_path: Path) -> None:
     plan = EvalConfig(
-        policies=[{"name": "raptor"}], suites=[{"envs": ["quadrotor:Hover"], "episodes": 3}], out=tmp_path / "run"
+        policies=[{"name": "raptor"}],
+        suites=[{"envs": ["quadrotor:Hover"], "episodes": 3}],
+        out=tmp_path / "run",
+        workers=0,
     )
-    summary = evaluate(plan, agent_factory=Raptor, in_process=True)
+    summary = evaluate(plan, agent_factory=Raptor)
     [cell] = summary.results.cells
     for i, one in enumerate(cell.episodes):
         states = fly([i], together(policy, 1), one.result.steps)

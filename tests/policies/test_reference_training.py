@@ -44,7 +44,7 @@ def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
     plan = yaml.safe_load((ROOT / "reference/demonstrations/tabletop.yaml").read_text())
     plan["suites"] = [suite | {"episodes": 2} for suite in plan["suites"]]
     plan["policies"] = [{"name": "expert"}]
-    evaluate(EvalConfig(**plan | {"out": folder / "runs"}), agent_factory=Scripted, in_process=True)
+    evaluate(EvalConfig(**plan | {"out": folder / "runs", "workers": 0}), agent_factory=Scripted)
     objects = ["puck", "target"]
     to_lerobot(Results.load(folder / "runs"), folder / "tabletop", successes=True, environment_state=objects)
     return folder

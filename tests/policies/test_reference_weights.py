@@ -47,9 +47,11 @@ def test_they_succeed_as_often_as_their_card_says(env: str, tmp_path: Path) -> N
     solved, episodes = RATES["tabletop"][env]
     options: dict[str, Any] = {"cameras": ["front", "wrist"], "width": 64, "height": 64}
     suite = SuiteConfig(envs=[env], env_options=options, episodes=EPISODES, seeds=[10_000])  # seeds of no evaluation
-    plan = EvalConfig(policies=[{"name": "reference", "execute": 4}], suites=[suite], out=tmp_path, video="none")
+    plan = EvalConfig(
+        policies=[{"name": "reference", "execute": 4}], suites=[suite], out=tmp_path, video="none", workers=0
+    )
     config = {"checkpoint": str(CHECKPOINT), "embodiment": "tabletop"}
-    found = evaluate(plan, agent_factory=lambda: Reference.from_config(config), in_process=True).total
+    found = evaluate(plan, agent_factory=lambda: Reference.from_config(config)).total
     assert (
         found.success_once.successes / EPISODES >= wilson(solved, episodes)[0] - 0.15
     )  # 30 episodes: a deviation of 0.05

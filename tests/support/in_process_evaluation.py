@@ -1,19 +1,17 @@
-"""Evaluations and rollouts that run in the test's process, without Ray."""
+"""Evaluations that run in the test's process, without Ray."""
 
 from __future__ import annotations
 
-import contextlib
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable
 from typing import Any
 
 from eval_fakes import ToZero
 
-from vlagents_ray.evaluate import EvalConfig, Results, run
+from vlagents_ray.evaluate import EvalConfig, Results
 from vlagents_ray.evaluate.artifacts.recorder import save
 from vlagents_ray.evaluate.artifacts.storage import versions
 from vlagents_ray.evaluate.plan.jobs import plan
 from vlagents_ray.evaluate.results.store import Store
-from vlagents_ray.evaluate.workers.pool import InProcessWorkers
 from vlagents_ray.evaluate.workers.rollout import Rollout
 from vlagents_ray.interface import Agent
 
@@ -39,19 +37,6 @@ def play(config: EvalConfig, make: Callable[[], Agent] = ToZero, *, left_out: It
         store.end_run("complete")
     worker.close()
     return Results.load(config.out)
-
-
-@contextlib.contextmanager
-def without_ray(module: Any = run, pool: type[InProcessWorkers] = InProcessWorkers) -> Iterator[None]:
-    """Within this the module's pool is one in this process, so that by default `evaluate` plays here."""
-    before: dict[str, Any] = {name: getattr(module, name) for name in ("WorkerPool", "ray_cluster")}
-    module.WorkerPool = pool
-    module.ray_cluster = lambda _config: contextlib.nullcontext()
-    try:
-        yield
-    finally:
-        for name, value in before.items():
-            setattr(module, name, value)
 
 
 _POLICY = {

@@ -1,6 +1,7 @@
-"""A Python environment with other systems' clients from PyPI, some of whose requirements conflict with ours.
+"""Python environments with other systems' clients from PyPI, some of whose requirements conflict with ours.
 
-The environment is `.venv-peers` of this checkout, the one that the benchmark uses; it is created at first use.
+They are `.venv-peers` and `.venv-peers-torch` of this checkout, those that the benchmark uses; each is created at first
+use.
 """
 
 from __future__ import annotations
@@ -11,21 +12,23 @@ import subprocess
 from pathlib import Path
 from typing import Any
 
-from benchmarks.peers import REQUIREMENTS, set_up
+from benchmarks.peers import REQUIREMENTS, TORCH, TORCH_REQUIREMENTS, set_up
 from vlagents_ray.serve.python_env.create import install, python_in
 
 FOLDER = Path(os.environ.get("VLAGENTS_PEERS", Path(__file__).parents[2] / ".venv-peers"))
 CLIENTS = Path(__file__).with_name("peer_clients.py")
 
 
-def peers_python() -> Path:
-    """Their Python, with the pinned packages in it."""
-    stamp = FOLDER / "installed.txt"
-    wanted = REQUIREMENTS.read_text()
+def peers_python(environment: str = "") -> Path:
+    """The Python of the first environment, or of the second if it is `TORCH`, with the pinned packages in it."""
+    folder = FOLDER.with_name(FOLDER.name + environment)
+    requirements = TORCH_REQUIREMENTS if environment == TORCH else REQUIREMENTS
+    stamp = folder / "installed.txt"
+    wanted = requirements.read_text()
     if not stamp.is_file() or stamp.read_text() != wanted:
-        set_up(FOLDER)
+        set_up(folder, requirements)
         stamp.write_text(wanted)
-    return python_in(FOLDER)
+    return python_in(folder)
 
 
 def drive(python: Path, client: str, *words: object, timeout_s: float = 120) -> Any:

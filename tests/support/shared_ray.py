@@ -65,7 +65,7 @@ def shared_server(config: Any) -> Iterator[Any]:
     """Serve a deployment on the shared Ray for the length of the context, as `running_server` does on one of its own.
 
     Args:
-        config: A `ServeDeploySchema`.
+        config: A `Deployment`.
 
     Yields:
         A `Server`.

@@ -21,7 +21,7 @@ from vlagents_ray.cli.options import (
     parse_time,
     read_run_file,
 )
-from vlagents_ray.cli.ray_session import RESUME, exit_if_ray_is_lost, quiet_ray
+from vlagents_ray.cli.ray_session import quiet_ray
 from vlagents_ray.errors import ConfigError
 
 if TYPE_CHECKING:
@@ -46,7 +46,13 @@ class EvalOptions:
     source: Annotated[str | None, typer.Option("--policy", help="Registered name, deployment file, or URL.")] = None
     out: Annotated[Path | None, typer.Option("--out", help="Folder of the results.")] = None
     episodes: Annotated[int | None, typer.Option(min=1, help="Episodes of each environment; default: 10.")] = None
-    workers: Annotated[int | None, typer.Option(min=1, help="Environments rolled out in parallel; default: 1.")] = None
+    workers: Annotated[
+        int | None,
+        typer.Option(
+            min=0,
+            help="Environments played in parallel; 0: in this process, without Ray. Default: 0 if short, else 1.",
+        ),
+    ] = None
     cpus: Annotated[
         float | None,
         typer.Option("--worker-cpus", min=0, help="CPUs of each worker, unless the file says how many; default: 0.5."),
@@ -143,7 +149,7 @@ def evaluate_command(options: EvalOptions) -> None:
     with --resume); 2 for invalid settings; 3 when an error of the policy ended every episode of a cell; 1 for any other
     failure, and when infrastructure lost an episode for good (--resume tries it again).
     """
-    with errors(), exit_if_ray_is_lost(RESUME):
+    with errors():
         config = config_from_options(options)
         on_robot = config.real_robot is not None
         options.require_together(on_robot=on_robot)

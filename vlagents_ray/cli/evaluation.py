@@ -8,17 +8,16 @@ import threading
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 from urllib.parse import urlsplit
 
-import ray
 import typer
 from rich.box import SIMPLE_HEAD
 from rich.table import Table
 
 from vlagents_ray.cli.console import fail, out
 from vlagents_ray.cli.listing import require_packages
-from vlagents_ray.cli.policies import policy_deployment, resolve_policies, served
+from vlagents_ray.cli.policies import Agents, policy_deployment, resolve_policies, served
 from vlagents_ray.errors import ConfigError, PolicyFailed
 from vlagents_ray.evaluate import (
     EvalConfig,
@@ -35,18 +34,20 @@ from vlagents_ray.evaluate.checkpoint_watcher import CheckpointWatcher, rounds
 from vlagents_ray.evaluate.plan.cases import EvalCase, cells
 from vlagents_ray.evaluate.plan.jobs import plan
 from vlagents_ray.evaluate.report.results_document import ProgressDocument, ResultsDocument
+from vlagents_ray.evaluate.report.terminal import LineProgress
 from vlagents_ray.evaluate.results.database import FILE
 from vlagents_ray.evaluate.results.summary import errors_of_policies, failing_cells, summarize
-from vlagents_ray.evaluate.workers.cluster import ray_cluster
+from vlagents_ray.evaluate.workers.base import chosen_workers
 from vlagents_ray.policies.base.checkpoint import STEP
+from vlagents_ray.ray_tools.private import node_of_this_process
 from vlagents_ray.serve.access.api_keys import load_keys
 from vlagents_ray.serve.launch.deployment_file import own_settings
 from vlagents_ray.serve.models.checkpoints import CHOICE
-from vlagents_ray.serve.observers.live_page import page_server, require_watch_keys
-from vlagents_ray.serve.observers.live_view import Fleet
 from vlagents_ray.serve.ports import LOOPBACK, is_free
-from vlagents_ray.serve.scaling.sibling_replicas import ReplicasInCluster
 from vlagents_ray.slurm.submission import UNFINISHED
+
+if TYPE_CHECKING:
+    from vlagents_ray.serve.scaling.sibling_replicas import ReplicasInCluster
 
 POLICY_ERRORS = 3  # exit status: an error of the policy ended every episode of a cell
 LOOK_S = 1.0  # period at which the folder is read
@@ -56,6 +57,8 @@ _NAME = "eval"  # the page's application, for keys that are limited to applicati
 
 def live_address(at: str | None) -> tuple[str, int]:
     """Return the (host, port) that `--live-at` states; None is `--live` alone."""
+    from vlagents_ray.serve.observers.live_page import require_watch_keys
+
     if at is None:
         return LOOPBACK, _PORT if is_free(LOOPBACK, _PORT) else 0
     try:
@@ -73,16 +76,21 @@ def live_address(at: str | None) -> tuple[str, int]:
 def shown_progress(config: EvalConfig, live: tuple[str, int] | None, *, goes_on: bool = False) -> Iterator[Progress]:
     """Show an evaluation on the terminal and, if that has an address, on the live page, within the context of its Ray.
 
+    Without workers the terminal shows lines: a table that is drawn again would disturb a debugger.
+
     Yields:
         The progress to evaluate with.
     """
+    progress = progress_for(out) if config.workers else LineProgress(out)
     if live is None:
-        yield progress_for(out)
+        yield progress
         return
-    document = ProgressDocument(config.out, progress_for(out), goes_on=goes_on)
+    from vlagents_ray.serve.scaling.sibling_replicas import ReplicasInCluster
+
+    document = ProgressDocument(config.out, progress, goes_on=goes_on)
     urls = [str(one.url) for one in config.policies]
     apps = [url.removeprefix("serve://") for url in urls if url.startswith("serve://")]
-    others = ReplicasInCluster(apps) if apps and ray.is_initialized() else None
+    others = ReplicasInCluster(apps) if apps and node_of_this_process() is not None else None
     with _page(document, others, live):
         try:
             yield document
@@ -102,6 +110,9 @@ def follow(results: Path, address: tuple[str, int]) -> None:
 
 @contextlib.contextmanager
 def _page(document: ResultsDocument, others: ReplicasInCluster | None, address: tuple[str, int]) -> Iterator[None]:
+    from vlagents_ray.serve.observers.live_page import page_server
+    from vlagents_ray.serve.observers.live_view import Fleet
+
     fleet = Fleet(None, others, document.read)
     with page_server(fleet, address, load_keys(), name=_NAME, videos=document.video) as url:
         out.print(f"live: {url}")
@@ -120,21 +131,27 @@ def run_evaluation(
 
     `end_at` is as in `evaluate`, and `live` the address of the live page, as for `shown_progress`.
     """
-    with served(config, address, replica_per_gpu=replica_per_gpu) as ready, shown_progress(ready, live) as progress:
-        summary = evaluate_and_print(ready, progress, end_at)
+    if live is not None and config.workers is None:  # the page also shows the sessions of replicas
+        config = config.model_copy(update={"workers": 1})
+    with contextlib.ExitStack() as stack:
+        ready, agents = stack.enter_context(served(config, address, replica_per_gpu=replica_per_gpu))
+        progress = stack.enter_context(shown_progress(ready, live))
+        summary = evaluate_and_print(ready, progress, end_at, agents)
     require_results(ready, summary)
 
 
 def play_one(config: EvalConfig, address: str | None, only: tuple[int, int]) -> Summary:
     """Serve the policy unless it is at a URL, and play one episode of it; `only` as in `evaluate`."""
-    with served(config, address) as ready:
-        return evaluate(ready, progress=progress_for(out), only=only)
+    with served(config, address) as (ready, agents), shown_progress(ready, None) as progress:
+        return evaluate(ready, agent_factory=agents, progress=progress, only=only)
 
 
-def evaluate_and_print(config: EvalConfig, progress: Progress, end_at: float | None = None) -> Summary:
-    """Evaluate policies at their URLs; an interrupted evaluation prints its results so far."""
+def evaluate_and_print(
+    config: EvalConfig, progress: Progress, end_at: float | None = None, agents: Agents | None = None
+) -> Summary:
+    """Evaluate policies, as `served` yields them; an interrupted evaluation prints its results so far."""
     try:
-        summary = evaluate(config, progress=progress, end_at=end_at)
+        summary = evaluate(config, agent_factory=agents, progress=progress, end_at=end_at)
     except PolicyFailed as error:
         results = Results.load(config.out)
         if not failing_cells(results):
@@ -211,16 +228,21 @@ def watch_training(
     first = next(found, None)
     if first is None:
         raise ConfigError(f"{watcher.folder}: watching ended without a checkpoint; still waiting: {watcher.waiting()}")
-    with (
-        served(_at(config, place, first), address) as ready,
-        ray_cluster(ready),
-        shown_progress(ready, live, goes_on=True) as progress,
-    ):
-        summary = evaluate_and_print(ready, progress)
+    workers = 1 if config.workers is None else config.workers  # a training is long
+    planned = _at(config, place, first).model_copy(update={"workers": workers})
+    with contextlib.ExitStack() as stack:
+        ready, agents = stack.enter_context(served(planned, address))
+        if ready.workers:
+            from vlagents_ray.evaluate.workers.cluster import ray_cluster
+
+            stack.enter_context(ray_cluster(ready))
+        progress = stack.enter_context(shown_progress(ready, live, goes_on=True))
+        summary = evaluate_and_print(ready, progress, agents=agents)
         every = [*first]
         for steps in found:
             every += steps
-            summary = evaluate_and_print(_at(ready, place, steps).model_copy(update={"resume": True}), progress)
+            later = _at(ready, place, steps).model_copy(update={"resume": True})
+            summary = evaluate_and_print(later, progress, agents=agents)
     require_results(_at(ready, place, every), summary)
 
 
@@ -258,7 +280,7 @@ def run_on_robot(config: EvalConfig, address: str | None, *, operator: str, unbl
         print_summary(out, unblind(config.out, config.robot.key if config.robot is not None else None))
         return
     planned_cells(config)  # raises before anything starts
-    with served(config, address) as ready, contextlib.ExitStack() as stack:
+    with served(config, address) as (ready, _), contextlib.ExitStack() as stack:
         person = TerminalOperator() if operator == "terminal" else stack.enter_context(PageOperator(out.print))
         summary = evaluate_on_robot(ready, person)
     print_summary(out, summary)
@@ -301,12 +323,14 @@ def print_plan(config: EvalConfig) -> None:
     planned, finished = sum(case.planned for case in cases), sum(one.finished for one in found)
     left = sum(one.left for one in found)
     # Workers share one queue, so that at most one episode's time is lost at the end.
-    seconds = sum(one.left * (one.seconds or 0.0) for one in found) / max(1, min(config.workers, left))
+    workers = chosen_workers(config)
+    seconds = sum(one.left * (one.seconds or 0.0) for one in found) / max(1, min(workers, left))
     unknown = sum(one.seconds is None for one in found)
     beside = f", and {unknown} cells whose envs were not played yet" if unknown else ""
     out.print(f"{len(found)} cells: {policies} policies at their checkpoints x {envs} environments of suites")
     out.print(f"{planned} episodes, {finished} of them finished in {config.out}, {left} to play")
-    out.print(f"{_time(seconds)} with {config.workers} workers, as long as episodes before{beside}")
+    where = f"with {workers} workers" if workers else "in one process, without Ray"
+    out.print(f"{_time(seconds)} {where}, as long as episodes before{beside}")
 
 
 def forecasts(planned: Sequence[EvalCase], results: Results | None) -> list[Forecast]:

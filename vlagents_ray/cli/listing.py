@@ -16,7 +16,7 @@ from vlagents_ray.errors import MissingDependency, VLAgentsError
 from vlagents_ray.registry import POLICIES, env_class, families, names, policy_class, wrapper_class
 
 if TYPE_CHECKING:
-    from ray.serve.schema import ServeDeploySchema
+    from vlagents_ray.serve.launch.deployment_file import Deployment
 
 
 _SHORT = 5  # most ranges of tasks that a line of the listing names
@@ -83,7 +83,7 @@ def installing(listed: Sequence[Listed]) -> Iterator[str]:
         yield line.format(", ".join(of))
 
 
-def require_packages(config: ServeDeploySchema) -> None:
+def require_packages(config: Deployment) -> None:
     """Raise `MissingDependency` if a policy that is to run in this environment lacks packages here.
 
     A checkout of its source is not required, as a setting may name one.

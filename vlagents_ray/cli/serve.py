@@ -20,8 +20,7 @@ from vlagents_ray.errors import ConfigError
 from vlagents_ray.serve.ports import EVERYWHERE, LOOPBACK
 
 if TYPE_CHECKING:
-    from ray.serve.schema import ServeDeploySchema
-
+    from vlagents_ray.serve.launch.deployment_file import Deployment
     from vlagents_ray.serve.launch.haproxy import Tls
 
 
@@ -77,7 +76,7 @@ class ServeOptions:
 @command_of(ServeOptions)
 def serve_command(options: ServeOptions) -> None:
     """Serve a policy until Ctrl-C."""
-    from vlagents_ray.serve.launch.deployment_file import listens_at, read_deployment, with_dialect, with_gateways_at
+    from vlagents_ray.serve.launch.deployment_file import read_deployment, with_dialect, with_gateways_at
     from vlagents_ray.serve.launch.server import running_server
 
     with errors():
@@ -87,8 +86,7 @@ def serve_command(options: ServeOptions) -> None:
             config = with_dialect(config, "vlagents", {"port": options.vlagents_port})
         if address is None:
             require_packages(config)
-        stated_host, stated_port = listens_at(config)
-        host, port = options.host or stated_host, options.port or stated_port
+        host, port = options.host or config.http_options.host, options.port or config.http_options.port
         access: dict[str, Any] = {
             "keys_file": keys,
             "insecure": insecure,
@@ -112,7 +110,7 @@ def serve_command(options: ServeOptions) -> None:
 
 
 def connection_lines(
-    config: ServeDeploySchema, urls: Mapping[str, str], host: str, keys: Path | None = None, *, insecure: bool = False
+    config: Deployment, urls: Mapping[str, str], host: str, keys: Path | None = None, *, insecure: bool = False
 ) -> Iterator[str]:
     """Return lines with the URL, policy and page of each application, and addresses for clients of other systems."""
     from vlagents_ray.serve.config.deployment import ServerArgs

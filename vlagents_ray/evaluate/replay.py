@@ -47,7 +47,7 @@ class Recorded:
         if policy is not None:
             given = {name: value for name, value in given.items() if name != "name"} | policy
         suite = cell.suite.model_dump() | {"envs": [cell.env], "worker": cell.worker.model_dump()}
-        alone = {"policies": [given], "suites": [suite], "out": out, "workers": 1, "resume": False}
+        alone = {"policies": [given], "suites": [suite], "out": out, "workers": None, "resume": False}
         return EvalConfig.model_validate(config.model_dump() | alone | {"video": "all", "record": "all", "track": []})
 
 

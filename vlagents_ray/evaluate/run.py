@@ -19,18 +19,15 @@ from vlagents_ray.evaluate.episode.records import EpisodeResult
 from vlagents_ray.evaluate.plan.cases import require_envs
 from vlagents_ray.evaluate.plan.config import EvalConfig
 from vlagents_ray.evaluate.plan.jobs import EpisodeKey, Job, JobQueue, plan
-from vlagents_ray.evaluate.report.page import FILE as REPORT
-from vlagents_ray.evaluate.report.page import write_report
 from vlagents_ray.evaluate.report.terminal import Progress
 from vlagents_ray.evaluate.results.reader import Results, rate_of
 from vlagents_ray.evaluate.results.statistics import Stopping
 from vlagents_ray.evaluate.results.store import Store
 from vlagents_ray.evaluate.results.summary import Summary, summarize, write_summary
 from vlagents_ray.evaluate.trackers import TrackerFeed
-from vlagents_ray.evaluate.workers.cluster import ray_cluster, unused_gpus
-from vlagents_ray.evaluate.workers.pool import FailedAttempts, InProcessWorkers, WorkerPool, Workers, dispatch
-from vlagents_ray.evaluate.workers.rollout import AgentFactory, Report, agents, factory_program
-from vlagents_ray.interface import Agent
+from vlagents_ray.evaluate.workers.base import FailedAttempts, Workers, chosen_workers, dispatch
+from vlagents_ray.evaluate.workers.in_process import workers_class
+from vlagents_ray.evaluate.workers.rollout import AgentFactory, OwnAgents, Report, agents, factory_program
 from vlagents_ray.ray_tools.signals import stop_signals
 
 log = logging.getLogger(__name__)
@@ -64,8 +61,7 @@ class OutOfTime(EvaluationInterrupted):
 def evaluate(
     config: EvalConfig,
     *,
-    agent_factory: Callable[[], Agent] | None = None,
-    in_process: bool = False,
+    agent_factory: OwnAgents = None,
     progress: Progress | None = None,
     only: tuple[int, int] | None = None,
     end_at: float | None = None,
@@ -73,13 +69,15 @@ def evaluate(
     """Play every episode of `config` that has no result yet, and write the results to `config.out`.
 
     Episodes run in Ray actors: in the cluster of this process, else in that of `RAY_ADDRESS`, else in a local one for
-    the length of the run. Each worker uses the policy at its `url`, or its own agent from `agent_factory`. Even if an
-    exception is raised, recorded episodes are kept, and summary.json and report.html are written if the disk has room.
+    the length of the run. With `config.workers` 0 they run in this process, on this thread, and time limits do not
+    apply; a short evaluation does that by default (see `chosen_workers`). Results are the same. Each worker uses the
+    policy at its `url`, or its own agent from `agent_factory`. Even if an exception is raised, recorded episodes are
+    kept, and summary.json and report.html are written if the disk has room.
 
     Args:
         config: The policies, the envs, and the folder of results.
-        agent_factory: Called in each worker to make its agent, in place of a connection to the policy's `url`.
-        in_process: Play in this process, without Ray: one worker, to which neither `workers` nor the time limits apply.
+        agent_factory: Called in each worker to make its agent, in place of a connection to the policy's `url`; or such
+            functions by the names of policies.
         progress: Shows the progress (`progress_for`); by default nothing is shown.
         only: (number, seed) of the one episode of each env that is played; by default all are.
         end_at: A time in seconds since 1970. No episode begins that would not end by then, by the durations of earlier
@@ -98,6 +96,7 @@ def evaluate(
     """
     if config.real_robot is not None:
         raise ConfigError("robot.arm: got a real robot, want a plan in simulation; see vlagents_ray.evaluate.robot")
+    config = config.model_copy(update={"workers": chosen_workers(config)})
     factory = agents(config, agent_factory)
     tracking = TrackerFeed(config)
     require_envs(config)
@@ -107,8 +106,8 @@ def evaluate(
             save_diffs(config.out, driver_code().values())
         try:
             with tracking:
-                local = {} if agent_factory is None else {"program": factory_program(agent_factory)}
-                run = _Run(config, store, progress or Progress(), tracking, only, end_at, in_process, local)
+                local = {"program": factory_program(agent_factory)} if callable(agent_factory) else {}
+                run = _Run(config, store, progress or Progress(), tracking, only, end_at, local)
                 state, summary = run.play(factory)
         except BaseException:
             with contextlib.suppress(StorageFailed):  # probably the same disk error; report the first one
@@ -122,11 +121,13 @@ def evaluate(
 
 def conclude(config: EvalConfig, store: Store, state: str) -> Summary:
     """Record the end of the run, and write its summary and its report."""
+    from vlagents_ray.evaluate.report.page import FILE, write_report  # late: an evaluation begins sooner
+
     with storing(config.out):
         store.end_run(state)
         summary = summarize(Results.load(config.out))
         write_summary(summary)
-        write_report(summary.results, config.out / REPORT)
+        write_report(summary.results, config.out / FILE)
     return summary
 
 
@@ -151,13 +152,12 @@ class _Run:
     tracking: TrackerFeed
     only: tuple[int, int] | None
     end_at: float | None
-    in_process: bool
     local_program: dict[str, Any]
 
     def __post_init__(self) -> None:
         config, store = self.config, self.store
         self._attempts = FailedAttempts(config)
-        self._checked_gpus = self.in_process  # when an env first drew
+        self._checked_gpus = not config.workers  # when an env first drew
         earlier = {cell.cell: cell for cell in Results.load(config.out).cells}
         self._recorded = {cell: rate_of([results], "success_once") for cell, results in earlier.items()}
         self._stopping: dict[str, Stopping] = {}
@@ -182,10 +182,12 @@ class _Run:
         """
         if not len(self._queue):
             return "complete", conclude(self.config, self.store, "complete")
-        with contextlib.nullcontext() if self.in_process else ray_cluster(self.config), stop_signals() as stop:
+        with contextlib.ExitStack() as stack:
+            pool_of = workers_class(self.config, stack)
+            stop = stack.enter_context(stop_signals())
             self.progress.begin(self.store.cells, self._recorded, len(self._queue))
             try:
-                with (InProcessWorkers if self.in_process else WorkerPool)(self.config, factory) as pool:
+                with pool_of(self.config, factory) as pool:
                     try:
                         while not stop.is_set() and not self._deadline.is_over:
                             if not pool.busy and not (len(self._queue) and self._deadline.leaves_room):
@@ -228,6 +230,8 @@ class _Run:
         if report.worker is not None:
             self.store.note_worker(report.worker)
             if report.worker.renderer is not None and not self._checked_gpus:
+                from vlagents_ray.evaluate.workers.cluster import unused_gpus
+
                 self._checked_gpus = True
                 if (hint := unused_gpus(job.cell, report.worker)) is not None:
                     log.warning(hint)

@@ -23,8 +23,8 @@ from vlagents_ray.evaluate.episode.second_pass import SecondPass
 from vlagents_ray.evaluate.plan.cases import cells, require_envs
 from vlagents_ray.evaluate.plan.config import EpisodeChoice, EvalConfig
 from vlagents_ray.evaluate.plan.jobs import EpisodeKey, Job, JobQueue
-from vlagents_ray.evaluate.workers.cluster import ray_cluster
-from vlagents_ray.evaluate.workers.pool import FailedAttempts, WorkerPool, Workers, dispatch
+from vlagents_ray.evaluate.workers.base import FailedAttempts, Workers, dispatch
+from vlagents_ray.evaluate.workers.in_process import workers_class
 from vlagents_ray.evaluate.workers.rollout import Report, agents
 from vlagents_ray.interface import BEHAVIOUR, WANT, Act, Agent, Obs
 from vlagents_ray.learn.columns import EXTRA, FINAL, REPLAY, at_rows, tensors
@@ -214,7 +214,7 @@ class RolloutPlan:
 
     env: str | Sequence[str]  # the name, as for an evaluation; several envs take turns
     policy: str | Callable[[], Agent]  # URL of a server, or a factory that each worker calls to create its own agent
-    workers: int = 1
+    workers: int = 1  # 0: in this process and on this thread, without Ray: the quickest for one env and a small policy
     num_envs: int = 1  # environments that one worker steps together, with one request to the policy for all
     groups: int = 1  # episodes from one start state, one after another, that differ in the seed of the policy (GRPO)
     want: Sequence[str] = ()  # what the policy returns for each act: "logprob", "value", "entropy", "replay"
@@ -406,8 +406,8 @@ class Rollouts:
         """Hand out jobs, and take the reports that arrive; any error ends the workers."""
         try:
             if self._pool is None:
-                self._resources.enter_context(ray_cluster(self._config))
-                self._pool = self._resources.enter_context(WorkerPool(self._config, self._factory, self._recorders))
+                pool_of = workers_class(self._config, self._resources)
+                self._pool = self._resources.enter_context(pool_of(self._config, self._factory, self._recorders))
                 self._queue = JobQueue(episode.job for episode in self._episodes.values())
             dispatch(self._pool, self._queue, self._begin)
             for job, report in self._pool.wait(POLL_S):

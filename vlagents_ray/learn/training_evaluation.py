@@ -108,8 +108,8 @@ class TrainingEvaluation:
             pushed = PushedWeights(version=version, fingerprint=fingerprint(agent.parameters()))
             session = _EvaluatedSession(agent, AgentCopies(agent), pushed)
             with evaluation_mode(None if agent.trainable is None else attrgetter(agent.trainable)(agent)):
-                plan = self._of(pushed)
-                return evaluate(plan, agent_factory=lambda: session, in_process=True, progress=self._progress)
+                plan = self._of(pushed).model_copy(update={"workers": 0})
+                return evaluate(plan, agent_factory=lambda: session, progress=self._progress)
         finally:
             self._last_s = monotonic() - begun
             self._spent_s += self._last_s

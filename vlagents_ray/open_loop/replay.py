@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import json
 import threading
-import uuid
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import Future, ThreadPoolExecutor
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from functools import partial
@@ -17,10 +16,9 @@ from typing import Any
 import numpy as np
 
 from vlagents_ray.client.agent import RemoteAgent
-from vlagents_ray.contract import Contract
 from vlagents_ray.errors import ConfigError, PolicyFailed, VLAgentsError
 from vlagents_ray.evaluate.artifacts.storage import storing, whole
-from vlagents_ray.interface import Act, Agent, Obs
+from vlagents_ray.interface import Agent
 from vlagents_ray.open_loop.recorded import (
     Names,
     RecordedDataset,
@@ -29,52 +27,16 @@ from vlagents_ray.open_loop.recorded import (
     RecordedStep,
     find_datasets,
 )
-from vlagents_ray.protocol.messages import Reply, Request
 from vlagents_ray.serve.config.deployment import ServerArgs
-from vlagents_ray.serve.engine.engine import Engine
 from vlagents_ray.serve.launch.deployment_file import own_settings, policy_application
+from vlagents_ray.serve.local_agent import LocalPolicy
 from vlagents_ray.serve.models.checkpoints import CHOICE, STEP
-from vlagents_ray.serve.python_env.child_agent import make_agent, version_of
-from vlagents_ray.serve.python_env.probe import with_process
-from vlagents_ray.serve.requests import PendingRequest, Rank
 from vlagents_ray.serve.weights import OPTION
 
 Sessions = Callable[[], Agent]  # opens a session; the caller closes it
 
 FILE = "open_loop.json"
 _WORST = 10
-
-
-class LocalAgent(Agent):
-    """One session of an engine in this process."""
-
-    def __init__(self, engine: Engine) -> None:
-        self._engine = engine
-        self._session = uuid.uuid4().hex
-
-    @property
-    def contract(self) -> Contract | None:
-        return self._engine.contract
-
-    def reset(self, obs: Obs, instruction: str | None, **kwargs: Any) -> dict[str, Any]:
-        return self._ask(Request("reset", obs, instruction, kwargs, rank="simulation")).info or {}
-
-    def act(self, obs: Obs) -> Act:
-        act = self._ask(Request("act", obs, rank="simulation")).act
-        if act is None:
-            raise PolicyFailed("act: the policy answered without an action")
-        return act
-
-    def close(self) -> None:
-        self._ask(Request("close", rank="simulation"))
-
-    def _ask(self, request: Request) -> Reply:
-        answer: Future[Reply] = Future()
-        self._engine.submit([PendingRequest(self._session, request, answer.set_result, Rank.SIMULATION)])
-        reply = answer.result()
-        if reply.error is not None:
-            raise reply.error
-        return reply
 
 
 @contextmanager
@@ -88,21 +50,9 @@ def candidate(source: str) -> Iterator[Sessions]:
         yield partial(RemoteAgent, source, rank="simulation", codec="exact")
         return
     application = policy_application(source)
-    args = ServerArgs(**application.args)
-    args = args.model_copy(update={"environment": with_process(args.environment)})
-    engine = Engine(
-        args.checkpoints.of(partial(make_agent, args), own_settings(application)),
-        max_batch_size=args.batch.max_size,
-        patience=args.batch.patience,
-        batch_sizes=args.batch.sizes or (),
-        version=version_of(args),
-        limits=args.limits.call_limits(),
-    )
-    try:
-        engine.start()
-        yield partial(LocalAgent, engine)
-    finally:
-        engine.close()
+    with LocalPolicy(ServerArgs(**application.args), own_settings(application), threaded=True) as policy:
+        policy.initialize()
+        yield lambda: policy.sessions(1)[0]
 
 
 @dataclass

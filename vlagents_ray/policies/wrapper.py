@@ -115,3 +115,11 @@ def build_agent(
             raise ConfigError(f"wrappers: {name!r} is {cls.__name__}, want a subclass of {Wrapper.__module__}.Wrapper")
         agent = cls.around(agent, settings or {})
     return agent
+
+
+def unloaded_contract(agent: Agent) -> Contract | None:
+    """Return the contract of a policy that is not loaded; None if it cannot state one yet."""
+    try:
+        return agent.contract
+    except Exception:  # noqa: BLE001 - a policy may raise any error before `initialize`
+        return None

@@ -8,6 +8,7 @@ offset 0   b"VLA" and the version byte 1
 
 from __future__ import annotations
 
+import codecs
 import json
 import math
 import re
@@ -121,7 +122,7 @@ def parse_json(
         if sum(map(data.count, marks)) > most:  # parsing would need far more memory and time than the length suggests
             raise MessageTooLarge(f"message: more than {most} values in its JSON; send arrays instead of lists")
     try:
-        decoded = data if isinstance(data, str) else data.decode("utf-8-sig")
+        decoded = data if isinstance(data, str) else data.removeprefix(codecs.BOM_UTF8).decode()
         value = json.loads(decoded, object_pairs_hook=pairs)
         if "\\u" in decoded:
             json.dumps(value, ensure_ascii=False).encode()  # raises an error for an unpaired surrogate
@@ -159,6 +160,6 @@ def read_array(data: Buffer, dtype: Any, shape: Any) -> np.ndarray:
     if math.prod(shape) * kind.itemsize != len(data):
         raise MalformedMessage(f"array: got {len(data)} bytes, want {shown(shape)} of {dtype}")
     try:
-        return np.frombuffer(data, kind).reshape(shape)
+        return np.ndarray(shape, kind, data)
     except (ValueError, OverflowError) as error:  # numpy cannot represent such a long axis, even beside an empty one
         raise MalformedMessage(f"array: got shape {shown(shape)}, which numpy does not know") from error

@@ -14,7 +14,6 @@ from pathlib import Path
 import pytest
 from eval_fakes import ToZero
 from faulty_disks import FULL, READ_ONLY, python_on
-from in_process_evaluation import without_ray
 
 from vlagents_ray.errors import ConfigError, ConnectionLost, DeadlineExceeded, StorageFailed
 from vlagents_ray.evaluate import EvalConfig, evaluate, run
@@ -28,13 +27,11 @@ COMMANDS = """
 import sys
 from pathlib import Path
 from eval_fakes import ToZero
-from in_process_evaluation import without_ray
 from vlagents_ray.cli.console import errors
 from vlagents_ray.evaluate import EvalConfig, evaluate
 config = EvalConfig.model_validate_json(sys.argv[2])
 def play(**changes):
-    with without_ray():
-        return evaluate(config.model_copy(update=changes), agent_factory=ToZero)
+    return evaluate(config.model_copy(update={"workers": 0, **changes}), agent_factory=ToZero)
 """
 UNTIL_FULL = (
     COMMANDS
@@ -121,20 +118,19 @@ def test_the_first_failure_is_the_one_that_is_told(config: Config, monkeypatch: 
 
     monkeypatch.setattr(run, "save", full)
     monkeypatch.setattr(Store, "end_run", full_too)
-    with without_ray(), pytest.raises(StorageFailed, match="while a video was written"):
-        evaluate(config(), agent_factory=ToZero)
+    with pytest.raises(StorageFailed, match="while a video was written"):
+        evaluate(config(workers=0), agent_factory=ToZero)
 
 
 def test_a_disk_that_fills_up_at_the_very_end_is_told(config: Config, monkeypatch: pytest.MonkeyPatch) -> None:
     def full(*_: object) -> None:
         raise OSError(errno.ENOSPC, "no space left")
 
-    with monkeypatch.context() as broken, without_ray():
+    with monkeypatch.context() as broken:
         broken.setattr(run, "write_summary", full)
         with pytest.raises(StorageFailed, match="the disk is full"):
-            evaluate(config(), agent_factory=ToZero)
-    with without_ray():
-        summary = evaluate(config(resume=True), agent_factory=ToZero)
+            evaluate(config(workers=0), agent_factory=ToZero)
+    summary = evaluate(config(workers=0, resume=True), agent_factory=ToZero)
     assert {one.run for cell in summary.results.cells for one in cell.episodes} == {1}
 
 
@@ -175,8 +171,7 @@ def test_a_full_disk_costs_nothing_that_was_recorded(size: str, config: Config, 
 
 @pytest.mark.hosts
 def test_reports_merges_and_exports_tell_a_read_only_folder_alike(config: Config, tmp_path: Path) -> None:
-    with without_ray():
-        evaluate(config(), agent_factory=ToZero)
+    evaluate(config(workers=0), agent_factory=ToZero)
     out, target = str(config().out), tmp_path / "target"
     target.mkdir()
     for words in (

@@ -145,8 +145,8 @@ class TestOnACluster:
 
 
 def test_what_a_stopped_cell_says_holds_and_resuming_plays_nothing(config: Config) -> None:
-    settings = config(episodes=40, stop=STOP)
-    summary = evaluate(settings, agent_factory=ToZero, in_process=True)
+    settings = config(episodes=40, stop=STOP, workers=0)
+    summary = evaluate(settings, agent_factory=ToZero)
     [cell] = summary.results.cells
     rate = rate_of([cell], "success_once")
     assert rate.interval == confidence_sequence(rate.successes, rate.episodes)
@@ -156,10 +156,10 @@ def test_what_a_stopped_cell_says_holds_and_resuming_plays_nothing(config: Confi
     assert written["success_once"]["error_rate"] == 0.05
     assert "wilson_95" not in written["success_once"]
     assert summary.total.infra_failures == 0
-    evaluate(config(episodes=40, stop=STOP, resume=True), agent_factory=ToZero, in_process=True)
+    evaluate(config(episodes=40, stop=STOP, workers=0, resume=True), agent_factory=ToZero)
     [again] = Results.load(settings.out).cells
     assert again.episodes == cell.episodes
-    whole = evaluate(config(episodes=40, resume=True), agent_factory=ToZero, in_process=True)
+    whole = evaluate(config(episodes=40, workers=0, resume=True), agent_factory=ToZero)
     assert whole.total.episodes == 40
     assert whole.total.success_once.error_rate is None
 

@@ -137,8 +137,8 @@ def test_a_tracker_that_fails_is_a_warning_and_the_others_go_on(
 
 
 def test_an_evaluation_tells_while_it_runs_and_at_its_end(config: Config) -> None:
-    settings = config(envs=[LINE, OTHER_LINE], episodes=2, track=["wandb"])
-    summary = evaluate(settings, agent_factory=ToZero, in_process=True)
+    settings = config(envs=[LINE, OTHER_LINE], episodes=2, track=["wandb"], workers=0)
+    summary = evaluate(settings, agent_factory=ToZero)
     assert summary.state == "complete"
     assert sorted(min(metrics) for _, _, metrics in Listener.told) == [
         f"{LINE}/episodes", f"{OTHER_LINE}/episodes", "total/episodes"

@@ -89,7 +89,7 @@ def test_the_end_of_each_file_is_kept_under_its_name(tmp_path: Path) -> None:
 
 
 def test_a_process_knows_the_files_that_it_writes_to(tmp_path: Path) -> None:
-    code = "from vlagents_ray.evaluate.workers.cluster import own_logs; import sys; print(own_logs(), file=sys.stderr)"
+    code = "from vlagents_ray.evaluate.workers.rollout import own_logs; import sys; print(own_logs(), file=sys.stderr)"
     with (tmp_path / "log").open("w") as file:
         subprocess.run([sys.executable, "-c", code], stdout=subprocess.DEVNULL, stderr=file, check=True)
     assert (tmp_path / "log").read_text().strip() == str([str(tmp_path / "log")])

@@ -18,8 +18,9 @@ from vlagents_ray.evaluate.episode.failures import Failure
 from vlagents_ray.evaluate.plan.cases import cells
 from vlagents_ray.evaluate.plan.jobs import EpisodeKey, Job, plan
 from vlagents_ray.evaluate.workers import pool
+from vlagents_ray.evaluate.workers.base import WorkerHandle
 from vlagents_ray.evaluate.workers.cluster import CapacityMonitor
-from vlagents_ray.evaluate.workers.pool import WorkerHandle, WorkerPool
+from vlagents_ray.evaluate.workers.pool import QUERIES_PER_S, WATCH_S, WorkerPool, watch_s
 from vlagents_ray.evaluate.workers.rollout import Report
 
 pytestmark = pytest.mark.usefixtures("shared_ray")
@@ -164,3 +165,8 @@ def test_reports_that_have_come_are_taken_in_one_turn(config: Config) -> None:
         done, _ = ray.wait([worker.running for worker in busy], num_returns=2, timeout=60)
         assert len(done) == 2
         assert {job.key for job, _ in pool.wait(10)} == {job.key for job in jobs[:2]}
+
+
+def test_many_workers_are_queried_less_often_so_that_one_driver_is_enough() -> None:
+    assert watch_s(1) == watch_s(100) == WATCH_S
+    assert all(workers / watch_s(workers) <= QUERIES_PER_S for workers in (300, 1000, 10_000))

@@ -12,7 +12,7 @@ import yaml
 from certificates import authority
 
 from vlagents_ray import ConfigError
-from vlagents_ray.serve.launch.deployment_file import deployment, listens_at, read_deployment
+from vlagents_ray.serve.launch.deployment_file import deployment, read_deployment
 from vlagents_ray.serve.launch.haproxy import Tls
 from vlagents_ray.serve.launch.server import running_server
 from vlagents_ray.serve.ports import EVERYWHERE
@@ -37,6 +37,9 @@ def application(args: str) -> str:
         (application("{policy: noop, dialects: {gr00t: {mapping: gr01t}}}"), "gr01t"),
         (application("{policy: noop, replicas: 1, autoscaling: {}}"), "exclude each other"),
         ("applications: 3", "applications"),
+        (application("{policy: noop}") + "\nproxy_location: Nowhere", "proxy_location"),
+        (application("{policy: noop}") + "\nlogging_config: {log_level: 3}", "log_level"),
+        (application("{policy: noop}").replace("name: a", "name: a, route_prefix: b"), "route_prefix"),
         ("a: [", "YAML"),
     ],
 )
@@ -50,9 +53,11 @@ def test_a_wrong_deployment_file_is_refused(tmp_path: Path, text: str, word: str
 def test_a_file_says_where_to_listen_and_nobody_is_let_in_by_default(tmp_path: Path) -> None:
     file = tmp_path / "d.yaml"
     file.write_text(application("{policy: noop}"))
-    assert listens_at(read_deployment(str(file))) == ("127.0.0.1", 8000)
+    http = read_deployment(str(file)).http_options
+    assert (http.host, http.port) == ("127.0.0.1", 8000)
     file.write_text(application("{policy: noop}") + f"\nhttp_options: {{host: {EVERYWHERE}, port: 8123}}")
-    assert listens_at(read_deployment(str(file))) == (EVERYWHERE, 8123)
+    http = read_deployment(str(file)).http_options
+    assert (http.host, http.port) == (EVERYWHERE, 8123)
 
 
 @pytest.mark.parametrize(

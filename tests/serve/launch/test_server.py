@@ -20,7 +20,7 @@ from vlagents_ray.ray_tools import head_monitor
 from vlagents_ray.ray_tools.private import gpus_here, long_polls
 from vlagents_ray.serve.access.key_store import new_key
 from vlagents_ray.serve.launch import server
-from vlagents_ray.serve.launch.deployment_file import deployment, together, with_replicas_on, with_settings
+from vlagents_ray.serve.launch.deployment_file import Deployment, deployment, together, with_replicas_on, with_settings
 from vlagents_ray.serve.launch.server import deploy, wait_for_proxies
 from vlagents_ray.serve.replica import replica
 
@@ -37,11 +37,11 @@ class FakeClient:
         self.by_serve.append(config)
 
 
-def changed(app: dict[str, Any], **beside: Any) -> ServeDeploySchema:
+def changed(app: dict[str, Any], **beside: Any) -> Deployment:
     """A file with further keys of an application, and of the file."""
     document = deployment("noop").model_dump(exclude_unset=True)
     document["applications"][0] |= app
-    return ServeDeploySchema(**document, **beside)
+    return Deployment(**document, **beside)
 
 
 @pytest.mark.parametrize("ends_at_once", [True, False])
@@ -71,11 +71,11 @@ def test_a_server_on_its_own_ray_builds_its_applications_itself(
         changed({}),
     ],
 )
-def test_what_serve_must_apply_is_deployed_by_serve(config: ServeDeploySchema, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_what_serve_must_apply_is_deployed_by_serve(config: Deployment, monkeypatch: pytest.MonkeyPatch) -> None:
     """So that another deployment of the file changes it without new replicas; in a cluster of others, all of it is."""
     client = FakeClient(monkeypatch)
     deploy(client, config, own=config != changed({}), ingress=True)
-    assert (client.by_serve, client.built_here) == ([config], [])
+    assert (client.by_serve, client.built_here) == ([config.for_serve()], [])
 
 
 @pytest.mark.parametrize("deaths", [0, 2])

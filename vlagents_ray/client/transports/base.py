@@ -3,6 +3,10 @@
 from __future__ import annotations
 
 import logging
+import math
+import os
+import select
+import socket
 import time
 from collections.abc import Sequence
 from typing import Any, Literal, Protocol
@@ -18,6 +22,8 @@ _OVER_A_NETWORK = {"auto": JPEG, "exact": LOSSLESS}  # codecs that depend on the
 
 _ANSWER_S = 2.0  # s, time limit for the first byte of the first replica
 _SILENT_S = 2.0  # s after which an unfinished attempt to connect is reported
+SPIN_S = 150e-6  # s to poll for an answer before sleeping
+FAST_S = 600e-6  # s; after an answer within this time, wake-up included, the next one is polled for
 
 
 class RequestChannel(Protocol):
@@ -85,6 +91,24 @@ def left_s(deadline: float) -> float:
     return max(1e-3, deadline - time.monotonic())
 
 
+def wait(connection: socket.socket, event: int, deadline: float) -> None:
+    """Sleep until the socket is ready for `select.POLLIN` or `POLLOUT`; raises `TimeoutError` at the deadline."""
+    left_s = deadline - time.monotonic()
+    poller = select.poll()
+    poller.register(connection, event)
+    if left_s <= 0 or not poller.poll(math.ceil(left_s * 1e3)):
+        raise TimeoutError
+
+
+def await_answer(poller: select.poll, connection: socket.socket, spin_until: float, deadline: float) -> None:
+    """Wait for `connection`, which `poller` polls, as `wait`; sleep only after `spin_until`, s of `perf_counter`."""
+    while not poller.poll(0):  # a poll costs a fraction of the exception that an empty read raises
+        if time.perf_counter() < spin_until:
+            os.sched_yield()  # other processes can use the core; to be woken up takes as long as everything else
+        else:
+            wait(connection, select.POLLIN, deadline)
+
+
 class CodecChoice:
     """The codec of a connection's cameras: the user's choice, or one that depends on the location of the server.
 
@@ -109,7 +133,7 @@ class CodecChoice:
     def codec_for(self, obs: Obs | None, most_bytes: float = float("inf")) -> ImageCodec:
         """Return the codec for an observation; never raw for more than `most_bytes`, unless the user chose that."""
         codec = self.codec or RAW
-        if codec == RAW and self._compressed is not None and obs is not None:
+        if self._compressed is not None and obs is not None and codec == RAW:
             size = sum(image.nbytes for image in obs.cameras.values())
             return self._compressed if size > most_bytes else RAW
         return codec

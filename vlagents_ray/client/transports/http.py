@@ -83,7 +83,7 @@ class HttpTransport:
                     raise
                 report.failed(error)
             time.sleep(pause_s)
-            pause_s = min(1.0, pause_s * 1.5)
+            pause_s = min(0.3, pause_s * 1.5)
 
     def _metadata(self, timeout_s: float) -> dict[str, Any]:
         # The session id selects the replica by its hash, since WebSockets rely on the load balancer's round robin for

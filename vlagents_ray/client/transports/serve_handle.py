@@ -291,9 +291,9 @@ class PlasmaTransport(UnixTransport):
 
 def this_node() -> str | None:
     """Return the id of the Ray node of this process; None for a Ray client, and without Ray."""
-    import ray
-
     if node_of_this_process() is None:
         return None
+    import ray
+
     node: str = ray.get_runtime_context().get_node_id()
     return node

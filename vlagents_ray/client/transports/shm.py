@@ -7,7 +7,6 @@ object store instead.
 from __future__ import annotations
 
 import fcntl
-import math
 import mmap
 import os
 import select
@@ -22,6 +21,7 @@ from typing import Any, ClassVar
 import numpy as np
 
 from vlagents_ray.client.credentials import ANONYMOUS, Credentials
+from vlagents_ray.client.transports.base import FAST_S, SPIN_S, await_answer, wait
 from vlagents_ray.errors import ConnectionLost, DeadlineExceeded, PolicyUnavailable
 from vlagents_ray.images.codecs import RAW
 from vlagents_ray.protocol import shm_layout
@@ -30,8 +30,6 @@ from vlagents_ray.protocol.messages import LocalAddress, Reply, Request, boot_id
 
 _MESSAGE_BYTES = 128 * 1024  # the longest reply that fits in a message, and a margin
 _CONTROL = socket.CMSG_SPACE(4)
-_SPIN_S = 150e-6  # s to poll for an answer before sleeping
-_FAST_S = 600e-6  # s; after an answer within this time, wake-up included, the next one is polled for
 _PAGE = mmap.PAGESIZE
 
 
@@ -99,7 +97,7 @@ class UnixTransport(ABC):
                 try:
                     self._receive(connection)
                 except BlockingIOError:
-                    _wait(connection, select.POLLIN, deadline)
+                    wait(connection, select.POLLIN, deadline)
             message, descriptor = self._write(requests, deadline)
             try:
                 _send_message(connection, message, deadline, descriptor)
@@ -111,24 +109,16 @@ class UnixTransport(ABC):
             raise
 
     def _await(self, connection: socket.socket, requests: Sequence[Request], deadline: float) -> list[Reply]:
-        """Return the replies to these requests, skipping those to earlier ones.
-
-        If the last answer was immediate, poll for a moment before sleeping: waking up takes as long as everything else.
-        Other processes can still use the core.
-        """
+        """Return the replies to these requests, skipping those to earlier ones."""
         begun = time.perf_counter()
-        spin_until = begun + (_SPIN_S if self._answers_fast else 0.0)
+        spin_until = begun + (SPIN_S if self._answers_fast else 0.0)
         while True:
-            while not self._poller.poll(0):  # a poll costs a fraction of the exception that an empty read raises
-                if time.perf_counter() < spin_until:
-                    os.sched_yield()
-                else:
-                    _wait(connection, select.POLLIN, deadline)
+            await_answer(self._poller, connection, spin_until, deadline)
             replies = self._receive(connection)
             if replies[0].answers(requests[0]):
                 if not replies[0].request_id:  # refused before it was parsed
                     self._writer = shm_layout.ShmWriter()
-                self._answers_fast = time.perf_counter() - begun < _FAST_S
+                self._answers_fast = time.perf_counter() - begun < FAST_S
                 return replies
 
     def _open(self, timeout_s: float) -> socket.socket:
@@ -181,21 +171,12 @@ def _send_message(connection: socket.socket, message: bytes, deadline: float, de
                 else:
                     socket.send_fds(connection, [message], [descriptor])
             except BlockingIOError:
-                _wait(connection, select.POLLOUT, deadline)
+                wait(connection, select.POLLOUT, deadline)
             else:
                 return
     finally:
         if descriptor is not None:
             os.close(descriptor)
-
-
-def _wait(connection: socket.socket, event: int, deadline: float) -> None:
-    """Sleep until the socket is ready for `select.POLLIN` or `POLLOUT`; raises `TimeoutError` at the deadline."""
-    left_s = deadline - time.monotonic()
-    poller = select.poll()
-    poller.register(connection, event)
-    if left_s <= 0 or not poller.poll(math.ceil(left_s * 1e3)):
-        raise TimeoutError
 
 
 def _require_same_user(connection: socket.socket) -> None:

@@ -9,12 +9,13 @@ from __future__ import annotations
 
 import contextlib
 import logging
-import secrets
+import os
+import select
 import socket
 import ssl
 import struct
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 from urllib.parse import SplitResult, urlsplit
 
@@ -27,12 +28,13 @@ from websockets.sync.client import connect
 from websockets.uri import parse_uri
 
 from vlagents_ray.client.credentials import ANONYMOUS, WEBSOCKET_LOG, Credentials, require_plain, tls_failure
-from vlagents_ray.client.transports.base import CodecChoice, first_timeout_s, left_s
+from vlagents_ray.client.transports.base import FAST_S, SPIN_S, CodecChoice, await_answer, first_timeout_s, left_s, wait
 from vlagents_ray.client.transports.http import HttpTransport, http_url, refusal
 from vlagents_ray.errors import ConnectionLost, DeadlineExceeded, MessageTooLarge, NoReplica, PolicyUnavailable
 from vlagents_ray.protocol.frame_layout import Buffer
 from vlagents_ray.protocol.frames import decode_replies, request_parts
 from vlagents_ray.protocol.messages import DEFAULT_LIMITS, SERVERS_MACHINE, STREAM_BYTES, Reply, Request, StreamAddress
+from vlagents_ray.protocol.websocket_frames import ReceiveBuffer, frame_head
 
 logger = logging.getLogger(__name__)
 
@@ -116,23 +118,30 @@ class Stream:
             max_size=DEFAULT_LIMITS.body_bytes,
             logger=WEBSOCKET_LOG,
         )
+        self._received = ReceiveBuffer(DEFAULT_LIMITS.body_bytes)
         self._messages: list[bytes] = []
         # Fresh memory, which the kernel clears page by page, costs more than all other work on a frame with images.
         self._kept = bytearray(_KEPT_BYTES)
         self._read_memory = memoryview(bytearray(_READ_BYTES))
         self._silent = False  # whether the server failed to read or answer the last message in time
+        self._answers_fast = True  # whether the last answer was immediate
         self._socket = socket.create_connection((host, port), timeout_s)
         try:
             self._socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
             self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
+            self._socket.setblocking(False)
+            self._poller = select.poll()
+            self._poller.register(self._socket, select.POLLIN)
             request = self._protocol.connect()
             request.headers.update(headers or {})
             self._protocol.send_request(request)
             self._flush(deadline)
             while self._protocol.state is State.CONNECTING:
-                self._read(deadline)
+                wait(self._socket, select.POLLIN, deadline)
+                self._read(lambda data: self._protocol.receive_data(bytes(data)), deadline)
                 if self._protocol.handshake_exc is not None:
                     raise self._protocol.handshake_exc
+            self._received.attach(self._protocol)
         except BaseException:
             self._socket.close()
             raise
@@ -148,23 +157,25 @@ class Stream:
         """
         self._check_open()
         try:
-            self._limit(time.monotonic() + timeout_s)
-            self._socket.sendall(self._frame(pieces))
+            self._send(self._frame(pieces), time.monotonic() + timeout_s)
         except TimeoutError as error:
             self._silent = True
             raise ConnectionAbortedError(f"the server took no message within {timeout_s:g} s") from error
 
     def recv(self, timeout_s: float) -> bytes:
         """Return the next binary message; raises `ConnectionClosed`, `OSError` if it broke, or `TimeoutError`."""
-        deadline = time.monotonic() + timeout_s
+        begun, deadline = time.perf_counter(), time.monotonic() + timeout_s
+        spin_until = begun + (SPIN_S if self._answers_fast else 0.0)
         try:
             while not self._messages:
                 self._check_open()
-                self._read(deadline)
+                await_answer(self._poller, self._socket, spin_until, deadline)
+                self._read(self._received.parse, deadline)
         except TimeoutError:
             self._silent = True
             raise
         self._silent = False
+        self._answers_fast = time.perf_counter() - begun < FAST_S
         return self._messages.pop(0)
 
     def close(self) -> None:
@@ -189,37 +200,23 @@ class Stream:
         for piece in pieces:
             view[at : at + len(piece)] = piece
             at += len(piece)
-        mask = secrets.token_bytes(4)
+        mask = os.urandom(4)
         masked = np.frombuffer(memory, np.uint32, -(-size // 4), _HEAD_BYTES)
         masked ^= np.frombuffer(mask, np.uint32)
-        if size < 126:
-            length = bytes([0x80 | size])
-        elif size < 2**16:
-            length = b"\xfe" + size.to_bytes(2, "big")
-        else:
-            length = b"\xff" + size.to_bytes(8, "big")
-        head = b"\x82" + length + mask
+        head = frame_head(size, mask)
         view[_HEAD_BYTES - len(head) : _HEAD_BYTES] = head
         return view[_HEAD_BYTES - len(head) : at]
 
     def _check_open(self) -> None:
         """Raise `ConnectionClosed` or `OSError` if the connection is closed, or is being closed by the server."""
-        if self._protocol.state is State.CLOSED:
+        if (state := self._protocol.state) is State.CLOSED:
             raise self._protocol.close_exc
-        if self._protocol.state is not State.OPEN:
+        if state is not State.OPEN:
             raise ConnectionResetError(f"the server closes the connection ({self._protocol.close_rcvd})")
 
-    def _limit(self, deadline: float) -> None:
-        """Set the deadline of the next call on the socket, s of `time.monotonic`."""
-        if (left_s := deadline - time.monotonic()) <= 0:
-            raise TimeoutError
-        self._socket.settimeout(left_s)
-
-    def _read(self, deadline: float) -> None:
-        self._limit(deadline)
-        count = self._socket.recv_into(self._read_memory)
-        if count:
-            self._protocol.receive_data(bytes(self._read_memory[:count]))
+    def _read(self, parse: Callable[[memoryview], None], deadline: float) -> None:
+        if count := self._socket.recv_into(self._read_memory):
+            parse(self._read_memory[:count])
         else:
             self._protocol.receive_eof()
         for event in self._protocol.events_received():
@@ -229,9 +226,14 @@ class Stream:
 
     def _flush(self, deadline: float) -> None:
         for piece in self._protocol.data_to_send():
-            if piece:
-                self._limit(deadline)
-                self._socket.sendall(piece)
+            self._send(memoryview(piece), deadline)
+
+    def _send(self, data: memoryview, deadline: float) -> None:
+        while data:
+            try:
+                data = data[self._socket.send(data) :]
+            except BlockingIOError:
+                wait(self._socket, select.POLLOUT, deadline)
 
 
 class WebSocketTransport:

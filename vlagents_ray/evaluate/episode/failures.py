@@ -8,6 +8,7 @@ from __future__ import annotations
 import math
 import sys
 import traceback
+from bdb import BdbQuit
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from numbers import Real
@@ -90,6 +91,7 @@ class env_side(_Side):  # noqa: N801 - a context manager
     """Turn any exception of a simulator into `EnvFailed`, except for wrong settings and refused actions."""
 
     def __exit__(self, _kind: object, error: BaseException | None, _trace: object) -> None:
+        _raise_if_quit(error)
         # ManiSkill raises SystemExit when an asset is missing.
         if isinstance(error, Exception | SystemExit) and not isinstance(error, _FROM_ENV):
             raise errors.EnvFailed(f"env {self._what}: {type(error).__name__}: {error}") from error
@@ -99,8 +101,15 @@ class policy_side(_Side):  # noqa: N801 - a context manager
     """Turn any exception of a policy into `PolicyFailed`; this package's own errors pass."""
 
     def __exit__(self, _kind: object, error: BaseException | None, _trace: object) -> None:
+        _raise_if_quit(error)
         if isinstance(error, Exception) and not isinstance(error, errors.VLAgentsError):
             raise errors.PolicyFailed(f"policy {self._what}: {type(error).__name__}: {error}") from error
+
+
+def _raise_if_quit(error: BaseException | None) -> None:
+    """Raise `KeyboardInterrupt` if the user has left a debugger: that is no error of either side."""
+    if isinstance(error, BdbQuit):
+        raise KeyboardInterrupt from error
 
 
 class EnvStep(NamedTuple):

@@ -223,7 +223,9 @@ class EvalConfig(_PlanModel):
     policies: list[PolicyConfig] = Field(min_length=1)
     suites: list[SuiteConfig] = Field(min_length=1)
     out: Path
-    workers: PositiveInt = 1  # environments rolled out in parallel
+    # Environments rolled out in parallel, each in a Ray actor. 0: one after another in this process, without Ray.
+    # None: 0 for a short evaluation, else 1 (see `chosen_workers`).
+    workers: NonNegativeInt | None = None
     video: EpisodeChoice = "failures"  # of which episodes there are videos
     record: EpisodeChoice = "none"  # of which there are trajectories: numbers and the policy's images
     resume: bool = False

@@ -17,7 +17,6 @@ from vlagents_ray.evaluate.episode.failures import Failure
 from vlagents_ray.evaluate.episode.records import EpisodeResult
 from vlagents_ray.evaluate.plan.cases import EvalCase
 from vlagents_ray.evaluate.plan.jobs import Job
-from vlagents_ray.evaluate.report.page import FILE as REPORT
 from vlagents_ray.evaluate.results.comparison import clock_gaps
 from vlagents_ray.evaluate.results.database import RUNNING
 from vlagents_ray.evaluate.results.statistics import Rate, confidence_sequence
@@ -243,6 +242,8 @@ def print_summary(console: Console, summary: Summary) -> None:
         console: The console.
         summary: The result of `evaluate`.
     """
+    from vlagents_ray.evaluate.report.page import FILE  # late: Jinja is needed when all is played
+
     console.print(results_table(summary))
     total = summary.total
     if total.policy_errors:
@@ -290,7 +291,7 @@ def print_summary(console: Console, summary: Summary) -> None:
     if summary.state != "complete":
         lines.append("still running" if summary.state == RUNNING else f"{summary.state}: go on with --resume")
     lines.append(f"results: {summary.out}")
-    written = {"report": summary.out / REPORT, "videos": summary.out / "videos"}
+    written = {"report": summary.out / FILE, "videos": summary.out / "videos"}
     lines += [f"{name}: {path}" for name, path in written.items() if path.exists()]
     for line in lines:
         console.print(line, markup=False, highlight=False, soft_wrap=True)

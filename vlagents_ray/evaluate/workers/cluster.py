@@ -25,17 +25,9 @@ from vlagents_ray.errors import ConfigError
 from vlagents_ray.evaluate.episode.records import WorkerInfo
 from vlagents_ray.evaluate.plan.cases import EvalCase
 from vlagents_ray.evaluate.plan.config import EvalConfig, WorkerConfig
+from vlagents_ray.evaluate.workers.rollout import THREAD_VARIABLES
 from vlagents_ray.ray_tools.session import joined
 
-# Set before any import in the worker, since several workers share a machine.
-THREAD_VARIABLES = (
-    "OMP_NUM_THREADS",
-    "MKL_NUM_THREADS",
-    "OPENBLAS_NUM_THREADS",
-    "NUMEXPR_NUM_THREADS",
-    "OPENCV_FOR_THREADS_NUM",
-    "LP_NUM_THREADS",  # llvmpipe and lavapipe, Mesa's software renderers
-)
 log = logging.getLogger(__name__)
 MOST_BYTES = 64_000  # most bytes of a kept log, all files together
 TIMEOUT_S = 5.0  # s for another node to read it
@@ -49,7 +41,7 @@ def ray_cluster(config: EvalConfig) -> Iterator[None]:
             stack.enter_context(joined())
         else:
             # CPUs are logical: the user's number of workers must fit.
-            cpus = max(os.cpu_count() or 1, ceil(config.workers * most_cpus(config)))
+            cpus = max(os.cpu_count() or 1, ceil((config.workers or 1) * most_cpus(config)))
             with withheld():  # workers get the key when they are ready; Ray's daemons need none
                 stack.enter_context(joined("local", num_cpus=cpus))
         yield
@@ -166,15 +158,6 @@ class CapacityMonitor:
         if idle_too_long:
             raise ConfigError(message)
         log.warning("going on with %d of %d workers: %s", running, self._config.workers, message)
-
-
-def own_logs() -> list[str]:
-    """Return the files of this process's standard output and error; in a Ray worker, Ray's log files."""
-    found = []
-    for number in (1, 2):
-        with contextlib.suppress(OSError):  # no /proc
-            found.append(os.readlink(f"/proc/self/fd/{number}"))
-    return [path for path in dict.fromkeys(found) if Path(path).is_file()]
 
 
 def tail(paths: Sequence[str]) -> str:

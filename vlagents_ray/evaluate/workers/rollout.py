@@ -14,8 +14,9 @@ import socket
 import sys
 import threading
 import traceback
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
+from pathlib import Path
 from time import monotonic, sleep
 from typing import Any
 
@@ -40,7 +41,6 @@ from vlagents_ray.evaluate.episode.records import EnvInfo, EpisodeResult, Worker
 from vlagents_ray.evaluate.plan.cases import EvalCase, env_program
 from vlagents_ray.evaluate.plan.config import EvalConfig, PolicyConfig
 from vlagents_ray.evaluate.plan.jobs import Job
-from vlagents_ray.evaluate.workers.cluster import own_logs
 from vlagents_ray.interface import Agent
 from vlagents_ray.policies.base.checkpoint import used_checkpoints
 from vlagents_ray.policies.base.checkpoint_files import weights_of
@@ -53,6 +53,16 @@ from vlagents_ray.registry import env_class
 log = logging.getLogger(__name__)
 
 AgentFactory = Callable[[PolicyConfig], Agent]
+OwnAgents = Callable[[], Agent] | Mapping[str, Callable[[], Agent]] | None
+# Set before any import in the worker, since several workers share a machine.
+THREAD_VARIABLES = (
+    "OMP_NUM_THREADS",
+    "MKL_NUM_THREADS",
+    "OPENBLAS_NUM_THREADS",
+    "NUMEXPR_NUM_THREADS",
+    "OPENCV_FOR_THREADS_NUM",
+    "LP_NUM_THREADS",  # llvmpipe and lavapipe, Mesa's software renderers
+)
 FIRST_WAIT_S = 0.5  # s before the next attempt to reach a policy, doubled each time
 LONGEST_WAIT_S = 10.0
 LONG_S = 1.0  # s in one phase, after which a query also reports the stack
@@ -269,17 +279,29 @@ def _metadata(agent: Agent) -> dict[str, Any]:
     return dict(getattr(agent, "metadata", {}))
 
 
-def agents(config: EvalConfig, own: Callable[[], Agent] | None, rank: RankName = "simulation") -> AgentFactory:
-    """Return the factory that a worker calls: `own`, or one of connections with this `rank`."""
-    if own is not None:
+def own_logs() -> list[str]:
+    """Return the files of this process's standard output and error; in a Ray worker, Ray's log files."""
+    found = []
+    for number in (1, 2):
+        with contextlib.suppress(OSError):  # no /proc
+            found.append(os.readlink(f"/proc/self/fd/{number}"))
+    return [path for path in dict.fromkeys(found) if Path(path).is_file()]
+
+
+def agents(config: EvalConfig, own: OwnAgents = None, rank: RankName = "simulation") -> AgentFactory:
+    """Return the factory that a worker calls: `own`, that of a policy's name in it, or one of `RemoteAgent`s."""
+    if callable(own):
         return lambda _policy: own()
+    made = own or {}
     for policy in config.policies:
-        if policy.url is None:
+        if policy.url is None and policy.name not in made:
             raise ConfigError(f"policy {policy.name!r}: got no url, want that of its server, as http://localhost:8000")
-    return functools.partial(_remote_agent, config, rank)
+    return functools.partial(_agent, config, made, rank)
 
 
-def _remote_agent(config: EvalConfig, rank: RankName, policy: PolicyConfig) -> RemoteAgent:
+def _agent(config: EvalConfig, own: Mapping[str, Callable[[], Agent]], rank: RankName, policy: PolicyConfig) -> Agent:
+    if policy.name in own:
+        return own[policy.name]()
     return RemoteAgent(
         str(policy.url),  # `agents` has checked that there is one
         transport=policy.transport,

@@ -11,8 +11,11 @@ from pydantic import AfterValidator, BaseModel, ConfigDict, Field, field_validat
 
 from vlagents_ray.interface import Agent
 from vlagents_ray.policies.adapters import ADAPTER
+from vlagents_ray.policies.base.program import Program, loaded_code
 from vlagents_ray.protocol.messages import DEFAULT_LIMITS, Limits
+from vlagents_ray.ray_tools.git_state import GitState, code_of
 from vlagents_ray.ray_tools.runtime_env import require_no_secrets
+from vlagents_ray.registry import names
 from vlagents_ray.serve.access.api_keys import Keys, load_keys
 from vlagents_ray.serve.config.dialects import DialectArgs
 from vlagents_ray.serve.models.checkpoints import Checkpoints
@@ -331,6 +334,13 @@ class ServerArgs(_DeploymentModel):
     record: RecordArgs | None = Field(default=None, description="keeps requests and answers; unset: nothing is kept")
     environment: EnvironmentArgs = Field(default=EnvironmentArgs(), description="the Python that the policy runs in")
     dialects: DialectArgs = Field(default=DialectArgs(), description="other systems' clients that may connect")
+
+    def code(self) -> tuple[GitState | None, Program]:
+        """Return the git state of the policy's code, and the digests of its files and of those of its wrappers."""
+        policy = names("policies").get(self.policy, self.policy)
+        wrappers = [name for one in self.wrappers for name in ([one] if isinstance(one, str) else one)]
+        classes = [policy, *(names("wrappers").get(name, name) for name in wrappers)]
+        return code_of(policy), {name: of for one in classes for name, of in loaded_code(one).items()}
 
     @model_validator(mode="after")
     def _one_scaling(self) -> ServerArgs:

@@ -18,16 +18,15 @@ import socket
 import threading
 import time
 from collections import deque
-from collections.abc import Callable, Collection, Generator
+from collections.abc import Callable, Collection
 from functools import partial
 from typing import ClassVar
 
 from websockets.frames import Frame, Opcode
 from websockets.http11 import Request as Handshake
 from websockets.http11 import Response
-from websockets.protocol import Protocol, State
+from websockets.protocol import State
 from websockets.server import ServerProtocol
-from websockets.streams import StreamReader
 
 from vlagents_ray.errors import (
     ConfigError,
@@ -40,6 +39,7 @@ from vlagents_ray.errors import (
 )
 from vlagents_ray.protocol import messages
 from vlagents_ray.protocol.frames import Decoded, decode_requests
+from vlagents_ray.protocol.websocket_frames import ReceiveBuffer, frame_head
 from vlagents_ray.serve.access.api_keys import Caller, Identity, NoKey, token_of
 from vlagents_ray.serve.access.origin_check import require_own_page
 from vlagents_ray.serve.endpoints.connection import (
@@ -64,7 +64,6 @@ from vlagents_ray.serve.requests import Message
 logger = logging.getLogger(__name__)
 
 _READ_BYTES = 1024 * 1024  # room for a message with two or three raw images
-_SMALL_BYTES = 1024  # parts of a frame up to this size are copied, since a view of them may outlast the buffer
 _SLOW_S = 10.0  # maximum time without progress for a client that does not read all replies at once
 _MAX_HANDSHAKES = 64  # maximum number of connections without a completed handshake
 _HANDSHAKE_BYTES = 16 * 1024  # maximum size of a handshake
@@ -180,7 +179,7 @@ class WebSocketConnection(PolledConnection):
         self._protocol = ServerProtocol(max_size=messages.STREAM_BYTES)  # guarded by the lock
         self._head = b""  # received part of the handshake
         self._refused_for_s = 0.0  # time after which the handshake is no longer over the rate of its key
-        self._received = ReceiveBuffer()
+        self._received = ReceiveBuffer(messages.STREAM_BYTES)
         self._out = SendBuffer(connection, self._sending, messages.STREAM_BYTES)
         self._paused = False  # whether too many messages are unanswered; guarded by the lock
         # Received but unprocessed frames, their arrival times, s, and the admissions of those received in parts.
@@ -434,79 +433,12 @@ class WebSocketConnection(PolledConnection):
     def _send(self, data: bytes) -> None:
         with self._sending:
             if not self._ended and self._protocol.state is State.OPEN:
-                self._protocol.send_binary(data)
-                self._flush()
+                self._out.send(frame_head(len(data)) + data)
 
     def _flush(self) -> None:
         """Send the bytes that the protocol has produced; the caller holds the lock."""
-        pieces = self._protocol.data_to_send()
-        self._out.send(b"".join(pieces), last=b"" in pieces)
-
-
-class ReceiveBuffer(StreamReader):
-    """The bytes of WebSocket frames that one connection has received, until they are parsed.
-
-    A message that arrives as a whole is parsed where it was read, and only copied when its mask is removed. The reader
-    of `websockets` copies each message three times.
-    """
-
-    buffer: bytes | bytearray | memoryview  # type: ignore[assignment]
-
-    def __init__(self) -> None:
-        super().__init__()
-        self._start = 0  # start of the unparsed bytes in `buffer`
-
-    @property
-    def size(self) -> int:
-        """Number of unparsed bytes; on other threads than that of `parse`, only whether it is 0 is reliable."""
-        return len(self.buffer) - self._start
-
-    def attach(self, protocol: Protocol) -> None:
-        """Become the reader of a protocol that has parsed all its bytes so far."""
-        protocol.reader = self
-        protocol.parser = Protocol.parse(protocol)  # the old parser reads from the old reader
-        next(protocol.parser)
-        self._protocol = protocol
-
-    def parse(self, data: bytes | memoryview) -> None:
-        """Parse bytes of `read_buffer`, and copy the rest after the last complete frame."""
-        self._protocol.receive_data(data)  # type: ignore[arg-type]
-        if isinstance(self.buffer, bytearray):
-            del self.buffer[: self._start]
-        else:
-            self.buffer = bytearray(self.buffer[self._start :])
-        self._start = 0
-
-    def feed_data(self, data: bytes | bytearray) -> None:
-        """Add bytes, as the protocol's parser requires; raise `EOFError` after `feed_eof`."""
-        if self.eof:
-            raise EOFError("stream ended")
-        if self.size:
-            self.buffer += data  # type: ignore[operator]
-        else:
-            self.buffer, self._start = data, 0
-
-    def read_exact(self, n: int) -> Generator[None, None, bytearray]:
-        """Return the next `n` bytes once they have arrived; many bytes that were just received are a view."""
-        while self.size < n:
-            if self.eof:
-                raise EOFError(f"stream ends after {self.size} bytes, expected {n} bytes")
-            yield
-        begin, self._start = self._start, self._start + n
-        found = self.buffer[begin : self._start]
-        return found if n > _SMALL_BYTES else bytearray(found)  # type: ignore[return-value]
-
-    def at_eof(self) -> Generator[None, None, bool]:
-        """Return whether the connection has ended, as soon as that is known; unparsed bytes mean that it has not."""
-        while not self.size:
-            if self.eof:
-                return True
-            yield
-        return False
-
-    def discard(self) -> None:
-        """Drop the unparsed bytes."""
-        self.buffer, self._start = bytearray(), 0
+        if pieces := self._protocol.data_to_send():
+            self._out.send(b"".join(pieces), last=b"" in pieces)
 
 
 class SendBuffer:

@@ -216,4 +216,4 @@ class MessageAdmission(Budget):
 def image_bytes(request: Request) -> int:
     """Return the decoded size of all images of a request, including its history, in bytes."""
     seen = request.history if request.obs is None else [request.obs, *request.history]
-    return sum(image.nbytes for obs in seen for image in obs.cameras.values())
+    return sum([image.nbytes for obs in seen for image in obs.cameras.values()])

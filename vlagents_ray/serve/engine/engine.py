@@ -120,6 +120,7 @@ class Engine:
         )
         self._thread = threading.Thread(target=self._serve, name="policy", daemon=True)
         self._started = threading.Event()  # set when loading the policy has succeeded or failed
+        self.threaded = True  # whether that is the engine's own thread, and not the one that called `start`
         self.alive = False  # whether a thread takes batches from the queue
         self._unsent: list[tuple[PendingRequest, Reply]] = []  # sent by another thread while the next batch runs
         self._answers = ThreadPoolExecutor(1, "policy-answers")
@@ -137,7 +138,7 @@ class Engine:
             PolicyFailed: The policy does not load, or not within the time limit.
         """
         try:
-            self.alive = True
+            self.alive, self.threaded = True, threaded
             if threaded:
                 self._thread.start()
                 if not self._started.wait(limit_s := self.calls.limits.load_s):
@@ -376,6 +377,8 @@ class Engine:
         try:
             self._run(taken.batch)
         except BaseException as error:  # a policy that calls sys.exit() must not end the replica's only thread
+            if not self.threaded:  # Ctrl-C in the thread that called
+                raise
             logger.exception("the batch failed")
             for pending in taken.batch:
                 pending.fail(PolicyFailed(f"the policy raised {type(error).__name__}"))

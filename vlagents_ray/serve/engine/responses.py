@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 import sysconfig
 import traceback
+from bdb import BdbQuit
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from types import MappingProxyType
@@ -67,9 +68,14 @@ def build_reply(
 
 
 def public_error(error: Exception, pending: PendingRequest) -> VLAgentsError:
-    """Return the error for the caller; details of an error of the policy are only logged."""
+    """Return the error for the caller; details of an error of the policy are only logged.
+
+    Raises `KeyboardInterrupt` if the user has left a debugger in the policy.
+    """
     if isinstance(error, VLAgentsError):
         return error
+    if isinstance(error, BdbQuit):
+        raise KeyboardInterrupt from error
     request = pending.request
     logger.error(
         "%s failed (session %s, request %s)", request.op, pending.session_id, request.request_id, exc_info=error

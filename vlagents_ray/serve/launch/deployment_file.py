@@ -5,37 +5,78 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import yaml
-from pydantic import ValidationError
-from ray.serve.schema import ServeApplicationSchema, ServeDeploySchema
+from pydantic import BaseModel, Field, ValidationError
 
 from vlagents_ray.contract import Contract
 from vlagents_ray.errors import ConfigError
 from vlagents_ray.policies.base.checkpoint import STEP as STEP_PLACE
-from vlagents_ray.policies.wrapper import build_agent
+from vlagents_ray.policies.wrapper import build_agent, unloaded_contract
 from vlagents_ray.ray_tools.runtime_env import require_no_secrets
 from vlagents_ray.registry import names, policy_class
 from vlagents_ray.serve.config.deployment import POLICY, ServerArgs
 from vlagents_ray.serve.models.checkpoints import CHOICE, STEP, Checkpoints
-from vlagents_ray.serve.python_env.child_main import unloaded_contract
 from vlagents_ray.serve.python_env.probe import check_policy, with_process
 from vlagents_ray.serve.requests import DEFAULT
 from vlagents_ray.settings import wrong_settings
 
+if TYPE_CHECKING:
+    from ray.serve.schema import ServeDeploySchema
+
 IMPORT_PATH = "vlagents_ray.serve.app:build"
 DEFAULT_HOST, DEFAULT_PORT = "127.0.0.1", 8000
+_OUR_APP_KEYS = {"name", "route_prefix", "import_path", "args"}  # without those that Serve must apply
 
 
-def deployment(policy: str, **args: Any) -> ServeDeploySchema:
+class HttpSettings(BaseModel, extra="allow"):
+    """Where the server listens; Serve's own default is all interfaces."""
+
+    host: str = DEFAULT_HOST
+    port: int = DEFAULT_PORT
+
+
+class Application(BaseModel, extra="allow"):
+    """An application, of this package or another one."""
+
+    name: str = "default"
+    route_prefix: Annotated[str, Field(pattern="^/")] | None = "/"
+    import_path: str
+    args: dict[str, Any] = {}
+    runtime_env: dict[str, Any] = {}
+    deployments: list[dict[str, Any]] = []  # settings of Serve, and `user_config`, by `name`
+
+
+class Deployment(BaseModel, extra="allow"):
+    """A deployment file: what this package reads of Serve's schema, which is read without importing Ray."""
+
+    applications: list[Application] = Field(min_length=1)
+    http_options: HttpSettings = HttpSettings()
+    proxy_location: Literal["Disabled", "HeadOnly", "EveryNode"] | None = None
+
+    @property
+    def plain(self) -> bool:
+        """Whether all applications are of this package, without settings that Serve must apply."""
+        beside = self.model_extra or self.http_options.model_extra
+        stated = [app.model_dump(exclude_defaults=True).keys() for app in self.applications]
+        return not beside and our_apps(self) == self.applications and all(keys <= _OUR_APP_KEYS for keys in stated)
+
+    def for_serve(self) -> ServeDeploySchema:
+        """Return Serve's schema of the file; raises `ValidationError` if a setting of Serve is wrong."""
+        from ray.serve.schema import ServeDeploySchema  # takes a second
+
+        return ServeDeploySchema.model_validate(self.model_dump(exclude_unset=True))
+
+
+def deployment(policy: str, **args: Any) -> Deployment:
     """Return the deployment of one policy, as if read from a file; `args` are those of `ServerArgs`."""
     return _of_name(policy, args)
 
 
 def read_deployment(
     source: str, overrides: Mapping[str, Any] | None = None, *, step_follows: bool = False
-) -> ServeDeploySchema:
+) -> Deployment:
     """Read a deployment and check it.
 
     Args:
@@ -69,9 +110,9 @@ def server_args(source: str, app: str | None = None) -> ServerArgs:
     return ServerArgs(**policy_application(source, app).args)
 
 
-def policy_application(source: str, app: str | None = None) -> ServeApplicationSchema:
+def policy_application(source: str, app: str | None = None) -> Application:
     """Return one application of a deployment that serves a policy: the one named `app`, or the only one."""
-    ours: dict[str, ServeApplicationSchema] = {one.name: one for one in our_apps(read_deployment(source))}
+    ours: dict[str, Application] = {one.name: one for one in our_apps(read_deployment(source))}
     if app is None and len(ours) == 1:
         [app] = ours
     if app not in ours:
@@ -79,7 +120,7 @@ def policy_application(source: str, app: str | None = None) -> ServeApplicationS
     return ours[app]
 
 
-def with_gateways_at(config: ServeDeploySchema, host: str) -> ServeDeploySchema:
+def with_gateways_at(config: Deployment, host: str) -> Deployment:
     """Return the deployment, with `host` as the default host of dialects that have their own port."""
     changed = config.model_copy(deep=True)
     for app in our_apps(changed):
@@ -88,7 +129,7 @@ def with_gateways_at(config: ServeDeploySchema, host: str) -> ServeDeploySchema:
     return changed
 
 
-def with_dialect(config: ServeDeploySchema, name: str, settings: Mapping[str, Any]) -> ServeDeploySchema:
+def with_dialect(config: Deployment, name: str, settings: Mapping[str, Any]) -> Deployment:
     """Return the deployment of one application, with these settings of a dialect in place of the file's."""
     changed = config.model_copy(deep=True)
     if len(our_apps(changed)) != 1:
@@ -100,7 +141,15 @@ def with_dialect(config: ServeDeploySchema, name: str, settings: Mapping[str, An
     return changed
 
 
-def together(policies: Mapping[str, ServeDeploySchema]) -> ServeDeploySchema:
+def only_application(name: str, part: Deployment) -> Application:
+    """Return the application of a deployment for the policy `name`; raises `ConfigError` if it holds several."""
+    if len(part.applications) != 1:
+        found = [one.name for one in part.applications]
+        raise ConfigError(f"{name}: holds {found}, want one application; serve it and give the URL of one of them")
+    return part.applications[0]
+
+
+def together(policies: Mapping[str, Deployment]) -> Deployment:
     """Join several policies into one deployment, each as an application under its name, without dialects.
 
     Raises:
@@ -108,18 +157,15 @@ def together(policies: Mapping[str, ServeDeploySchema]) -> ServeDeploySchema:
     """
     applications = []
     for name, part in policies.items():
-        if len(part.applications) != 1:
-            found = [one.name for one in part.applications]
-            raise ConfigError(f"{name}: holds {found}, want one application; serve it and give the URL of one of them")
-        app = part.applications[0].model_dump(exclude_unset=True)
+        app = only_application(name, part).model_dump(exclude_unset=True)
         app.get("args", {}).pop("dialects", None)
         applications.append(app | {"name": name, "route_prefix": f"/{name}"})
     return _checked({"applications": applications}, ", ".join(policies))
 
 
 def with_settings(
-    config: ServeDeploySchema, settings: Mapping[str, Any], *, steps: bool = False, step_follows: bool = False
-) -> ServeDeploySchema:
+    config: Deployment, settings: Mapping[str, Any], *, steps: bool = False, step_follows: bool = False
+) -> Deployment:
     """Return the deployment, with these settings of its policies in place of the file's.
 
     With `steps`, sessions may choose any checkpoint step. See `read_deployment` for `step_follows`.
@@ -127,13 +173,13 @@ def with_settings(
     changed = config.model_copy(deep=True)
     for app in our_apps(changed):
         app.args["config"] = own_settings(app) | dict(settings)
-        app.deployments = [one for one in app.deployments if one.name != POLICY]
+        app.deployments = [one for one in app.deployments if one.get("name") != POLICY]
         if steps:
             app.args["checkpoints"] = (app.args.get("checkpoints") or {}) | {"steps": True}
     return _checked(changed.model_dump(exclude_unset=True), "settings", step_follows)
 
 
-def with_replicas_on(config: ServeDeploySchema, gpus: float) -> ServeDeploySchema:
+def with_replicas_on(config: Deployment, gpus: float) -> Deployment:
     """Return the deployment with as many replicas as fit on `gpus`, each on one unless the file states another number.
 
     A policy is not changed if its file states the number of replicas, autoscaling, or zero GPUs.
@@ -147,20 +193,13 @@ def with_replicas_on(config: ServeDeploySchema, gpus: float) -> ServeDeploySchem
     return changed
 
 
-def listens_at(config: ServeDeploySchema) -> tuple[str, int]:
-    """Return host and port of the file, or the defaults of this package; Serve would listen on all interfaces."""
-    http = config.http_options
-    stated = http.model_fields_set
-    return http.host if "host" in stated else DEFAULT_HOST, http.port if "port" in stated else DEFAULT_PORT
-
-
-def own_settings(app: ServeApplicationSchema) -> dict[str, Any]:
+def own_settings(app: Application) -> dict[str, Any]:
     """Return the policy's settings: `config`, and `user_config`, which may change while the policy runs."""
-    beside = [one.user_config for one in app.deployments if one.name == POLICY and isinstance(one.user_config, dict)]
-    return {**app.args.get("config", {}), **(beside[0] if beside else {})}
+    beside = next((one.get("user_config") for one in app.deployments if one.get("name") == POLICY), None)
+    return {**app.args.get("config", {}), **(beside or {})}
 
 
-def stated_contract(config: ServeDeploySchema) -> Contract | None:
+def stated_contract(config: Deployment) -> Contract | None:
     """Return the contract of a deployment's policy, without loading the policy.
 
     Returns:
@@ -174,21 +213,23 @@ def stated_contract(config: ServeDeploySchema) -> Contract | None:
     return _contract(args, offered, offered.settings(DEFAULT, offered.config))
 
 
-def our_apps(config: ServeDeploySchema) -> list[Any]:
+def our_apps(config: Deployment) -> list[Application]:
     """Return the applications of a deployment that serve a policy."""
     return [app for app in config.applications if app.import_path == IMPORT_PATH]
 
 
-def _of_name(policy: str, args: Mapping[str, Any], step_follows: bool = False) -> ServeDeploySchema:
+def _of_name(policy: str, args: Mapping[str, Any], step_follows: bool = False) -> Deployment:
     name = policy.rpartition(":")[2]
     app = {"name": name, "route_prefix": "/", "import_path": IMPORT_PATH, "args": {"policy": policy, **args}}
     return _checked({"applications": [app]}, f"policy {policy!r}", step_follows)
 
 
-def _checked(document: object, source: str, step_follows: bool = False) -> ServeDeploySchema:
-    """Return the document as Serve's schema, with the `args` of this package checked before anything starts."""
+def _checked(document: object, source: str, step_follows: bool = False) -> Deployment:
+    """Return the document, with the `args` of this package and the settings of Serve checked before anything starts."""
     try:
-        config = ServeDeploySchema.model_validate(document)
+        config = Deployment.model_validate(document)
+        if not config.plain or len(config.applications) > 1:
+            config.for_serve()
         for runtime_env in _runtime_envs(config):
             require_no_secrets(runtime_env)
         for app in our_apps(config):
@@ -198,21 +239,19 @@ def _checked(document: object, source: str, step_follows: bool = False) -> Serve
                 app.args["environment"] = args.environment.model_dump(exclude_unset=True)
             if args.record is not None:
                 app.args["record"] = args.record.model_dump(exclude_unset=True)
-            installed = not (app.runtime_env or {})
-            _require_policy(args, own_settings(app), installed=installed, step_follows=step_follows)
+            _require_policy(args, own_settings(app), installed=not app.runtime_env, step_follows=step_follows)
     except ValidationError as error:
-        model = ServerArgs if error.title == ServerArgs.__name__ else ServeDeploySchema
+        model = ServerArgs if error.title == ServerArgs.__name__ else Deployment
         raise ConfigError(f"{source}: {wrong_settings(error, model)}") from error
     return config
 
 
-def _runtime_envs(config: ServeDeploySchema) -> Iterator[Mapping[str, Any]]:
+def _runtime_envs(config: Deployment) -> Iterator[Mapping[str, Any]]:
     """Yield the runtime environments of the applications and of their deployments."""
     for app in config.applications:
-        yield app.runtime_env or {}
+        yield app.runtime_env
         for one in app.deployments:
-            options = one.model_dump(include={"ray_actor_options"}, exclude_unset=True).get("ray_actor_options") or {}
-            yield options.get("runtime_env") or {}
+            yield (one.get("ray_actor_options") or {}).get("runtime_env") or {}
 
 
 def _require_policy(args: ServerArgs, own: dict[str, Any], *, installed: bool, step_follows: bool) -> None:

@@ -22,14 +22,13 @@ from typing import Any
 import ray
 from ray import serve
 from ray.serve.exceptions import RayServeException
-from ray.serve.schema import ServeDeploySchema
 
 from vlagents_ray.errors import ConfigError, PolicyUnavailable
 from vlagents_ray.ray_tools import head_monitor, private, session
 from vlagents_ray.ray_tools.reaper import MARK
 from vlagents_ray.serve.access.api_keys import require_access, warn_of_plain_http
 from vlagents_ray.serve.config.deployment import AccessArgs, ServerArgs
-from vlagents_ray.serve.launch.deployment_file import our_apps, with_gateways_at, with_replicas_on
+from vlagents_ray.serve.launch.deployment_file import Deployment, our_apps, with_gateways_at, with_replicas_on
 from vlagents_ray.serve.launch.haproxy import (
     NO_INGRESS,
     PublicListener,
@@ -46,9 +45,6 @@ _SHUTDOWN_S = 30.0
 _PROXIES_S = 60.0  # time for Serve's proxies to listen; the first ones may be replaced
 _LOOK_S = 0.2  # interval of the checks which proxies Serve has
 _START_S, _GROW_S = 600.0, 3600.0  # time for a policy to become ready: here; on a cluster that may add a machine first
-# Keys of a deployment file, and of an application in it, that do not require Serve to apply the file.
-_OUR_KEYS = {"applications", "http_options", "proxy_location"}
-_OUR_APP_KEYS = {"name", "route_prefix", "import_path", "args"}
 _REMIND_S = 30.0
 
 
@@ -103,7 +99,7 @@ class Server:
 
 @contextlib.contextmanager
 def running_server(
-    config: ServeDeploySchema,
+    config: Deployment,
     *,
     host: str = "127.0.0.1",
     port: int = 0,
@@ -184,7 +180,7 @@ def running_server(
         yield Server(url, {name: url + path for name, path in paths.items()})
 
 
-def _access(config: ServeDeploySchema, keys_file: Path | None, insecure: bool, plain_http: bool) -> ServeDeploySchema:
+def _access(config: Deployment, keys_file: Path | None, insecure: bool, plain_http: bool) -> Deployment:
     """Return the deployment with the access settings of the command line, if any."""
     if keys_file is not None and insecure:
         raise ConfigError("keys and insecure exclude each other; keep one")
@@ -200,7 +196,7 @@ def _access(config: ServeDeploySchema, keys_file: Path | None, insecure: bool, p
     return changed
 
 
-def deploy(client: Any, config: ServeDeploySchema, *, own: bool, ingress: bool) -> None:
+def deploy(client: Any, config: Deployment, *, own: bool, ingress: bool) -> None:
     """Deploy the applications, without waiting for them.
 
     For a deployment file, Serve starts a process that imports the server again. On our `own` Ray, applications of this
@@ -210,11 +206,8 @@ def deploy(client: Any, config: ServeDeploySchema, *, own: bool, ingress: bool) 
     """
     from vlagents_ray.serve.app import application
 
-    stated = [app.model_dump(exclude_defaults=True).keys() for app in config.applications]
-    ours = len(our_apps(config)) == len(config.applications)
-    plain = ours and config.model_fields_set <= _OUR_KEYS and all(keys <= _OUR_APP_KEYS for keys in stated)
-    if not plain or not own:
-        client.deploy_apps(config)
+    if not config.plain or not own:
+        client.deploy_apps(config.for_serve())
         return
     targets = [
         serve.RunTarget(application(ServerArgs(**app.args), drains=ingress), app.name, app.route_prefix)
@@ -223,7 +216,7 @@ def deploy(client: Any, config: ServeDeploySchema, *, own: bool, ingress: bool) 
     serve.run_many(targets, wait_for_ingress_deployment_creation=False, wait_for_applications_running=False)
 
 
-def _require_gpus(config: ServeDeploySchema, here: float | None = None) -> None:
+def _require_gpus(config: Deployment, here: float | None = None) -> None:
     """Raise `ConfigError` if the replicas need more GPUs than a Ray started here has, since they would wait forever.
 
     `here` is the number of GPUs that a new local Ray would have. An existing cluster may grow: there, missing GPUs
@@ -235,7 +228,7 @@ def _require_gpus(config: ServeDeploySchema, here: float | None = None) -> None:
         raise ConfigError(f"{missing}; where there are more, see `vlagents-ray doctor`")
 
 
-def _missing_gpus(config: ServeDeploySchema, here: float | None = None) -> str | None:
+def _missing_gpus(config: Deployment, here: float | None = None) -> str | None:
     """Return a sentence about the GPUs that this machine, or the running cluster, lacks; None if it has enough."""
     wanted = {app.name: _gpus(ServerArgs(**app.args)) for app in our_apps(config)}
     there = ray.cluster_resources().get("GPU", 0.0) if here is None else here
@@ -256,7 +249,7 @@ def _gpus(args: ServerArgs) -> float:
     return replicas * args.resources.num_gpus
 
 
-def _check_access(config: ServeDeploySchema, host: str, insecure: bool, tls: Tls | None) -> None:
+def _check_access(config: Deployment, host: str, insecure: bool, tls: Tls | None) -> None:
     """Check the access to each application, and warn if keys would cross the network unencrypted.
 
     Raises:
@@ -302,7 +295,7 @@ def _ray(
         yield {"host": host, "port": port}
 
 
-def spread_over_gpus(parts: Mapping[str, ServeDeploySchema], *, kept: float = 0.0) -> dict[str, ServeDeploySchema]:
+def spread_over_gpus(parts: Mapping[str, Deployment], *, kept: float = 0.0) -> dict[str, Deployment]:
     """Return deployments that share the GPUs of the connected cluster equally, except for `kept` GPUs."""
     share = max(0.0, ray.cluster_resources().get("GPU", 0.0) - kept) / len(parts)
     return {name: with_replicas_on(part, share) for name, part in parts.items()}

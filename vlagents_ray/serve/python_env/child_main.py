@@ -24,10 +24,9 @@ from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 from typing import Any
 
-from vlagents_ray.contract import Contract
 from vlagents_ray.errors import ConfigError, NotTrainable, PolicyFailed, PolicyUnavailable, VLAgentsError
 from vlagents_ray.interface import Agent
-from vlagents_ray.policies.wrapper import build_agent
+from vlagents_ray.policies.wrapper import build_agent, unloaded_contract
 from vlagents_ray.protocol.json_messages import problem
 from vlagents_ray.protocol.messages import INNER_OPS, Limits
 from vlagents_ray.serve.access.api_keys import NoKey
@@ -71,14 +70,6 @@ def examine(policy: str, config: dict[str, Any], wrappers: Sequence[Any] = ()) -
         return {"code": ConfigError.code, "error": f"policy {policy}: {type(error).__name__}: {error}"}
     contract = unloaded_contract(agent)
     return {"contract": None if contract is None else contract.to_json()}
-
-
-def unloaded_contract(agent: Agent) -> Contract | None:
-    """Return the contract of a policy that is not loaded; None if it cannot state one yet."""
-    try:
-        return agent.contract
-    except Exception:  # noqa: BLE001 - a policy may raise any error before `initialize`
-        return None
 
 
 def run() -> None:

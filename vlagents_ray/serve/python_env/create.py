@@ -147,7 +147,7 @@ def make_environment(
             for override in _overrides(requirements, Path(scratch)):
                 asked += ["--override", str(override)]
             if not cuda:
-                _require_no_cuda(made, asked)
+                require_no_cuda(made, asked)
         progress(f"installing {_US} {importlib.metadata.version(_US)} and {requirements}")
         install(made, asked)
     _install_import_fixes(made)
@@ -221,7 +221,7 @@ def _for_driver(scratch: Path, progress: Progress) -> list[str]:
     return ["--constraint", str(constraints)]
 
 
-def _require_no_cuda(python: Path, wanted: Sequence[str]) -> None:
+def require_no_cuda(python: Path, wanted: Sequence[str]) -> None:
     plan = _uv(["pip", "install", "--dry-run", "--python", str(python), *wanted])
     if found := _CUDA.findall(plan):
         raise ConfigError(

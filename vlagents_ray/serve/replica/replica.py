@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import asyncio
 import faulthandler
-import importlib.metadata
 import logging
 import os
 from collections import Counter
@@ -21,12 +20,9 @@ from starlette.types import ASGIApp
 from vlagents_ray.client.transports.serve_handle import ClientApi
 from vlagents_ray.errors import PolicyFailed, PolicyUnavailable, VLAgentsError
 from vlagents_ray.policies.base.accelerator import GPU_SHARE, VISIBLE
-from vlagents_ray.policies.base.program import loaded_code
 from vlagents_ray.protocol.frames import Decoded, decode_requests
 from vlagents_ray.protocol.messages import PROTOCOL_VERSION, SERVERS_MACHINE, Limits, boot_id
-from vlagents_ray.ray_tools.git_state import code_of
 from vlagents_ray.ray_tools.private import gpus_here, http_options, replica_is_ending
-from vlagents_ray.registry import names
 from vlagents_ray.serve.access.api_keys import NoKey, require_access, warn_of_plain_http
 from vlagents_ray.serve.access.audit import write_audit
 from vlagents_ray.serve.config.deployment import ServerArgs
@@ -40,12 +36,11 @@ from vlagents_ray.serve.endpoints.websocket import WebSocketServer
 from vlagents_ray.serve.endpoints.weights import weights_routes
 from vlagents_ray.serve.engine.engine import Engine
 from vlagents_ray.serve.engine.sender import Sender
-from vlagents_ray.serve.models.checkpoints import resolved
+from vlagents_ray.serve.local_agent import build_engine, policy_metadata
 from vlagents_ray.serve.observers.live_page import live_routes
 from vlagents_ray.serve.observers.live_view import Fleet
 from vlagents_ray.serve.observers.opening import open_observers
 from vlagents_ray.serve.ports import EVERYWHERE, HOST, LOOPBACK
-from vlagents_ray.serve.python_env.child_agent import make_agent, version_of
 from vlagents_ray.serve.queue.batch_queue import LoadMeter
 from vlagents_ray.serve.replica.metrics import Exporter, tags_of
 from vlagents_ray.serve.scaling.autoscaling import SESSIONS, UTILISATION, WAITING
@@ -83,11 +78,7 @@ class PolicyReplica(ClientApi, SiblingApi):
         self._gateway = gateway
         self._gateways: dict[str, Any] = {}
         self._app = serve.get_replica_context().app_name
-        policy = names("policies").get(settings.policy, settings.policy)
-        self._code = code_of(policy)
-        wrappers = [name for one in settings.wrappers for name in ([one] if isinstance(one, str) else one)]
-        wrappers = [names("wrappers").get(name, name) for name in wrappers]
-        self._program = {name: of for one in (policy, *wrappers) for name, of in loaded_code(one).items()}
+        self._code, self._program = settings.code()
         self._keys = settings.access.keys()
         require_access(http_options().host or EVERYWHERE, self._keys, settings.access.insecure)
         write_audit()  # also without keys, to log the buttons pressed on the live page
@@ -99,7 +90,7 @@ class PolicyReplica(ClientApi, SiblingApi):
         self._peers = SiblingReplicas()
         self._migrator = SessionMigrator(self._peers.others, asyncio.get_running_loop())
         self._limits = settings.limits.limits()
-        self._engine = _engine(settings, self._limits, self._migrator)
+        self._engine = _engine(settings, self._migrator)
         self._configured = False
         self._migrator.start(self._engine)
         self._rebalancer = Rebalancer(self._engine, self._peers, self._load_of)
@@ -211,21 +202,8 @@ class PolicyReplica(ClientApi, SiblingApi):
 
     def metadata(self) -> dict[str, Any]:
         """Return the document of `GET /v1/metadata` and `RemoteAgent.metadata`."""
-        contract, models = self._engine.contract, self._engine.models
-        return {
-            "policy": self._args.policy,
-            "checkpoint": resolved(models.config),
-            "weights": models.weights,
-            "devices": models.devices,
-            "policy_version": self._engine.weights.describe(),
-            "checkpoints": models.describe(),
-            "config": models.config,
-            "contract": None if contract is None else contract.to_json(),
-            "continues_plans": models.continues_plans,
+        return policy_metadata(self._args, self._engine, self._code, self._program) | {
             "protocol": PROTOCOL_VERSION,
-            "version": importlib.metadata.version("vlagents-ray"),
-            "code": None if self._code is None else self._code.to_json(),
-            "program": self._program | models.files,
             "dialects": self._args.dialects.describe() | self._gateways,
             "local": None if self._local is None else asdict(self._local.address),
             "stream": None if self._stream is None else asdict(self._stream.address),
@@ -364,26 +342,13 @@ class PolicyReplica(ClientApi, SiblingApi):
             await asyncio.sleep(_GATEWAY_POLL_S)
 
 
-def _engine(args: ServerArgs, limits: Limits, migrator: SessionMigrator) -> Engine:
+def _engine(args: ServerArgs, migrator: SessionMigrator) -> Engine:
     """Create the engine, without loading the policy."""
     if 0 < args.resources.num_gpus < 1:
         os.environ.setdefault(GPU_SHARE, str(args.resources.num_gpus))
     if VISIBLE not in args.environment.env_vars:
         hide_gpus(ray.get_runtime_context().get_accelerator_ids().get("GPU", []))
-    return Engine(
-        args.checkpoints.of(partial(make_agent, args), args.config),
-        max_batch_size=args.batch.max_size,
-        patience=args.batch.patience,
-        batch_sizes=args.batch.sizes or (),
-        session_limit=args.sessions.limit,
-        session_idle_s=args.sessions.idle_s,
-        version=version_of(args),
-        check=args.dialects.require_fit,
-        limits=args.limits.call_limits(),
-        reply_bytes=limits.reply_bytes,
-        in_flight_bytes=limits.in_flight_bytes,
-        finder=migrator,
-    )
+    return build_engine(args, args.config, migrator)
 
 
 def _stream_endpoint(engine: Engine, args: ServerArgs, admit: Admit | NoKey) -> WebSocketServer:

@@ -1,0 +1,50 @@
+"""portal: its `BatchServer`, with the batching in a process of its own, its default, and its `Client`.
+
+It waits until a batch is full, however long that takes, so there is a method for each size, and clients call the one of
+their number, or of the largest batch. The server polls without a pause.
+"""
+
+from __future__ import annotations
+
+import time
+
+import numpy as np
+import peer
+import portal
+
+_POLL_S = 0.25  # `Future.wait` can miss the answer that comes as it begins to wait
+_LATE_S = 0.5  # for an answer after the end of a run
+
+
+def serve(host: str, port: int, policy: peer.Policy) -> None:
+    """Run the server until the process ends."""
+    portal.setup(host=host)
+    server = portal.BatchServer(port)
+    for size in range(1, policy.batch + 1):
+        server.bind(f"act_{size}", lambda *arrays: policy(len(arrays[0])), batch=size)
+    server.start()
+
+
+def connect(target: peer.Target) -> peer.Client:
+    """Connect portal's client."""
+    obs = (*target.cameras.values(), target.state)
+    client = portal.Client(f"{target.host}:{target.port}")
+    method, deadline = "act_1", float("inf")
+
+    def before(clients: int, end: float) -> None:
+        nonlocal method, deadline
+        method, deadline = f"act_{min(clients, target.policy.batch)}", end + _LATE_S
+
+    def act(obs: tuple[np.ndarray, ...]) -> np.ndarray:
+        future = client.call(method, *obs)
+        while not future.done():
+            if time.monotonic() > deadline:
+                raise TimeoutError("the batch was not filled")
+            future.wait(_POLL_S)
+        return future.result()
+
+    return peer.Client(lambda: obs, act, client.close, before)
+
+
+if __name__ == "__main__":
+    peer.run(serve, connect)

@@ -1,0 +1,136 @@
+"""`vlagents-ray eval` in its own process: without Ray, with checkpoints, and under a debugger."""
+
+from __future__ import annotations
+
+import os
+import pty
+import subprocess
+import sys
+from collections.abc import Mapping
+from pathlib import Path
+
+import pytest
+import yaml
+from eval_fakes import LINE, PYTHONPATH
+from typer.testing import CliRunner
+
+from vlagents_ray.cli.main import app
+from vlagents_ray.evaluate import Results
+from vlagents_ray.serve.launch.deployment_file import IMPORT_PATH
+
+POLICY = """
+import os
+from pathlib import Path
+import numpy as np
+from vlagents_ray.contract import ActionSpec, Contract, StateSpec
+from vlagents_ray.interface import Act, Agent
+
+class Stepped(Agent):
+    def __init__(self, checkpoint, checkpoint_step=None):
+        self.file = Path(checkpoint.replace("{step}", str(checkpoint_step)))
+
+    @property
+    def contract(self):
+        return Contract(state={"position": StateSpec(1)}, action=ActionSpec(dim=1))
+
+    def initialize(self):
+        self.length = float(self.file.read_text())
+
+    def reset(self, obs, instruction, *, seed=None, **kwargs):
+        self.noise = np.random.default_rng(seed)
+        return {}
+
+    def act(self, obs):
+        if "STOP" in os.environ:
+            breakpoint()
+        return Act(-np.sign(obs.state["position"]) * self.length * self.noise.uniform(0.9, 1.0, 1))
+"""
+# As if it were not installed: whatever imports it fails.
+WITHOUT_RAY = "import sys; sys.modules['ray'] = None; from vlagents_ray.cli import main; main()"
+POISON = [sys.executable, "-c", WITHOUT_RAY]
+
+
+def deployment(**args: object) -> dict[str, object]:
+    return {"applications": [{"name": "a", "import_path": IMPORT_PATH, "args": {"policy": "stepped:Stepped", **args}}]}
+
+
+@pytest.fixture
+def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """The working directory, with a policy and two checkpoints of it."""
+    (tmp_path / "stepped.py").write_text(POLICY)
+    for step, length in ((1, 0.5), (2, 1.0)):
+        (tmp_path / f"w-{step}.txt").write_text(str(length))
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("PYTHONPATH", PYTHONPATH)
+    for name in ("RAY_ADDRESS", "PYTHONBREAKPOINT"):  # Ray sets the latter in a process that connects
+        monkeypatch.delenv(name, raising=False)
+    return tmp_path
+
+
+def test_named_policies_deployment_files_and_checkpoints_are_played_without_ray(folder: Path) -> None:
+    choices = {"late": {"checkpoint": "w-2.txt"}}
+    own = deployment(config={"checkpoint": "w-1.txt"}, checkpoints={"choices": choices})
+    (folder / "own.yaml").write_text(yaml.safe_dump(own))
+    swept = {"name": "swept", "source": "stepped:Stepped", "config": {"checkpoint": "w-{step}.txt"}, "steps": [1, 2]}
+    chosen = {"name": "chosen", "source": "own.yaml", "options": {"checkpoint": "late"}}
+    still = {"name": "still", "source": "noop", "config": {"action_dim": 1}}
+    plan = {"policies": [swept, chosen, still], "suites": [{"envs": [LINE], "episodes": 4}], "video": "none"}
+    (folder / "runs.yaml").write_text(yaml.safe_dump(plan))
+    done = subprocess.run(
+        [*POISON, "eval", "runs.yaml"], capture_output=True, text=True, timeout=120, check=False, cwd=folder
+    )
+    assert done.returncode == 0, done.stdout + done.stderr
+    assert "a short evaluation, in this process without Ray (--workers 1 plays" in done.stdout
+    cells = {cell.contender: cell for cell in Results.load(folder / "runs" / "runs").cells}
+    actions = {name: [one.result.actions_sha256 for one in cell.episodes] for name, cell in cells.items()}
+    assert actions["swept@2"] == actions["chosen"]
+    assert len({tuple(one) for one in actions.values()}) == 3
+    assert {one.result.checkpoint for one in cells["swept@1"].episodes} == {"w-1.txt"}
+    assert {one.result.transport for cell in cells.values() for one in cell.episodes} == {"local"}
+
+
+REFUSED: Mapping[str, tuple[dict[str, object], list[str], str]] = {
+    "cluster": ({"url": "serve://pi0"}, [], "serve://pi0 is inside a Ray cluster; want 1 or more"),
+    "address": ({"source": "noop"}, ["--address", "auto"], "got 0 with --address, want 1 or more in a cluster"),
+    "packages": (
+        {"source": "packages.yaml"},
+        [],
+        "but 'noop' has a runtime_env, or another import_path",
+    ),
+    "worker": ({"source": "noop"}, [], "a worker's runtime_env has 'pip'"),
+}
+
+
+@pytest.mark.parametrize("why", REFUSED)
+def test_what_only_ray_can_do_is_refused(why: str, folder: Path) -> None:
+    policy, words, text = REFUSED[why]
+    packages = deployment(policy="noop")
+    packages["applications"][0]["runtime_env"] = {"pip": ["einops"]}  # type: ignore[index]
+    (folder / "packages.yaml").write_text(yaml.safe_dump(packages))
+    plan = {"policies": [policy], "suites": [{"envs": [LINE]}], "workers": 0}
+    if why == "worker":
+        plan["worker"] = {"runtime_env": {"pip": ["einops"]}}  # type: ignore[assignment]
+    (folder / "runs.yaml").write_text(yaml.safe_dump(plan))
+    done = CliRunner().invoke(app, ["eval", "runs.yaml", *words], env={"COLUMNS": "300"})
+    assert done.exit_code == 2, done.output
+    assert text in done.stderr
+    assert not (folder / "runs").exists()
+
+
+def test_a_debugger_stops_in_the_policy_with_the_terminal_and_leaving_it_ends_the_command(folder: Path) -> None:
+    ours, its = pty.openpty()
+    words = [*POISON, "eval", LINE, "--policy", "stepped:Stepped", "--set", "checkpoint=w-1.txt", "--out", "out"]
+    with subprocess.Popen(words, stdin=its, stdout=its, stderr=its, env=os.environ | {"STOP": "1"}) as process:
+        os.close(its)
+        for text, answer in ((b"(Pdb) ", b"self.length * 84\n"), (b"42.0\r\n(Pdb) ", b"q\n")):
+            seen = b""
+            while not seen.endswith(text):
+                try:
+                    seen += os.read(ours, 4096)
+                except OSError as error:  # the command has ended
+                    raise AssertionError(seen.decode()) from error
+            os.write(ours, answer)
+        assert process.wait(60) == 130
+    os.close(ours)
+    [cell] = Results.load(folder / "out").cells
+    assert cell.episodes == ()

@@ -1,0 +1,112 @@
+"""A deployment's policy in this process has the results of a replica."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from eval_fakes import LINE
+from in_process_evaluation import flat_config
+from in_process_replicas import Replicas
+
+from vlagents_ray.contract import ActionSpec, Contract, StateSpec
+from vlagents_ray.errors import ContractMismatch, UnknownCheckpoint
+from vlagents_ray.evaluate import Summary, evaluate
+from vlagents_ray.interface import Act, Agent, Obs
+from vlagents_ray.serve.config.deployment import ServerArgs
+from vlagents_ray.serve.local_agent import LocalPolicy
+
+THIS = f"{__name__}:Trembling"
+
+
+class Trembling(Agent):
+    """Goes to zero in steps of a length, which tremble; its own count of acts must be that of one episode."""
+
+    def __init__(self, length: float = 1.0) -> None:
+        self.length, self.acts = length, 0
+
+    @property
+    def contract(self) -> Contract:
+        return Contract(state={"position": StateSpec(1)}, action=ActionSpec(dim=1))
+
+    def reset(self, obs: Obs, instruction: str | None, *, seed: int | None = None, **kwargs: Any) -> dict[str, Any]:
+        self.noise = np.random.default_rng(seed)
+        return {}
+
+    def act(self, obs: Obs) -> Act:
+        self.acts += 1
+        if self.acts == 3 and self.noise.random() < 0.3:
+            raise ValueError("a third act that fails at times")
+        return Act(-np.sign(obs.state["position"]) * self.length * self.noise.uniform(0.5, 1.0, 1))
+
+
+@pytest.fixture
+def replica() -> Iterator[Replicas]:
+    replicas = Replicas([Trembling(0.8)])
+    yield replicas
+    replicas.close()
+
+
+def outcomes(summary: Summary) -> list[dict[str, Any]]:
+    """What is the same in all runs; the message of an error has the id of its request."""
+    found = [one.result.outcome for cell in summary.results.cells for one in cell.episodes]
+    return [one | {"error": (one["error"] or "").partition(";")[0]} for one in found]
+
+
+@pytest.mark.parametrize("num_envs", [1, 3])
+def test_its_episodes_are_those_of_a_replica(num_envs: int, replica: Replicas, tmp_path: Path) -> None:
+    args = ServerArgs(policy=THIS)
+    found = []
+    for name, make in {
+        "here": partial(LocalPolicy, args, {"length": 0.8}),
+        "there": partial(replica.agent, rank="simulation", resume=False),
+    }.items():
+        plan = flat_config(envs=[LINE], episodes=12, num_envs=num_envs, workers=0, video="none", out=tmp_path / name)
+        found.append(evaluate(plan, agent_factory=make))
+    here, there = map(outcomes, found)
+    assert here == there
+    assert {one["status"] for one in here} == {"done", "policy_error"}
+    described = found[0].results.policies["policy"]
+    assert (described["policy"], described["config"]) == (THIS, {"length": 0.8})
+
+
+def test_a_session_chooses_its_checkpoint_which_is_loaded_meanwhile(tmp_path: Path) -> None:
+    args = ServerArgs(policy=THIS, checkpoints={"choices": {"short": {"length": 0.25}}})
+    agent = LocalPolicy(args, {"length": 1.0})
+    agent.initialize()
+    obs = Obs(state={"position": np.ones(1, np.float32)})
+    sizes = {}
+    for options in ({}, {"checkpoint": "short"}, {}):
+        agent.reset(obs, "go", seed=1, **options)
+        sizes[options.get("checkpoint")] = float(abs(agent.act(obs).action[0]))
+    assert sizes["short"] == pytest.approx(sizes[None] / 4)
+    with pytest.raises(UnknownCheckpoint, match="short"):
+        agent.reset(obs, "go", checkpoint="long")
+    agent.close()
+
+
+def test_the_contract_of_the_environment_is_compared_first() -> None:
+    agent = LocalPolicy(ServerArgs(policy=THIS), {})
+    agent.initialize()
+    other = Contract(state={"position": StateSpec(2)}, action=ActionSpec(dim=1)).to_json()
+    with pytest.raises(ContractMismatch, match="position"):
+        agent.reset(Obs(state={"position": np.ones(2, np.float32)}), "go", contract=other)
+    agent.close()
+
+
+def test_ctrl_c_in_a_call_is_no_error_of_the_policy(monkeypatch: pytest.MonkeyPatch) -> None:
+    def interrupted(*_: object) -> Act:
+        raise KeyboardInterrupt
+
+    agent = LocalPolicy(ServerArgs(policy=THIS), {})
+    agent.initialize()
+    obs = Obs(state={"position": np.ones(1, np.float32)})
+    agent.reset(obs, "go", seed=1)
+    monkeypatch.setattr(Trembling, "act", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        agent.act(obs)
+    agent.close()

@@ -1,0 +1,154 @@
+"""The workers that play episodes: their interface and number, and the dispatch of jobs."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+from abc import abstractmethod
+from collections import Counter
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+from typing import Any
+
+from vlagents_ray.errors import ConfigError, PolicyFailed, from_code
+from vlagents_ray.evaluate.episode.failures import Failure
+from vlagents_ray.evaluate.plan.cases import EvalCase, cells
+from vlagents_ray.evaluate.plan.config import EvalConfig, WorkerConfig
+from vlagents_ray.evaluate.plan.jobs import Job, JobQueue
+from vlagents_ray.evaluate.workers.rollout import Heartbeat, Report
+from vlagents_ray.ray_tools.private import node_of_this_process
+
+SHORT_STEPS = 10_000  # planned steps up to which Ray's start, some seconds, is a large part of the time
+_STEPS = 300  # of an episode, if the options of its environment name no `max_steps`
+VARIABLES = "env_vars"  # in Ray's runtime environment
+
+
+def chosen_workers(config: EvalConfig) -> int:
+    """Return `config.workers` or, if that is None, 0 for a short evaluation that needs no Ray, else 1.
+
+    A single worker plays one episode after another, as this process does, so that Ray adds its start and a message to
+    each act. In return a simulator that crashes or hangs is replaced, which a long evaluation needs. Ray is also chosen
+    if this process is in a cluster or `RAY_ADDRESS` names one, and for workers with a GPU.
+
+    Raises:
+        ConfigError: `config.workers` is 0, and something needs Ray.
+    """
+    planned, urls = cells(config), [url for one in config.policies for url in (one.url, one.source) if url]
+    needs = [f"{url} is inside a Ray cluster" for url in urls if url.startswith("serve://")]
+    packages = {name for cell in planned for name in cell.worker.runtime_env} - {VARIABLES}
+    needs += [f"a worker's runtime_env has {name!r}" for name in sorted(packages)]
+    if config.workers == 0 and needs:
+        raise ConfigError(f"workers: got 0, which plays in this process without Ray, but {needs[0]}; want 1 or more")
+    if config.workers is not None:
+        return config.workers
+    limits = [(cell.planned, cell.suite.env_options.get("max_steps")) for cell in planned]
+    steps = sum(episodes * (limit if isinstance(limit, int) else _STEPS) for episodes, limit in limits)
+    in_cluster = node_of_this_process() is not None or bool(os.environ.get("RAY_ADDRESS"))
+    return int(bool(needs) or in_cluster or any(cell.worker.gpus for cell in planned) or steps > SHORT_STEPS)
+
+
+@dataclass(slots=True, eq=False)
+class WorkerHandle:
+    """A worker of the pool. Times are those of `time.monotonic()`."""
+
+    config: WorkerConfig
+    kind: str  # identifies `config`
+    actor: Any
+    starting: Any  # ObjectRef of `ready()`; None once the worker runs
+    started_at: float  # time of its start
+    jobs: tuple[Job, ...] = ()  # the jobs that it plays, all of one cell
+    running: Any = None  # ObjectRef of `run(jobs)`
+    env_place: str | None = None  # the place of its environment
+    query: Any = None  # ObjectRef of `progress()`
+    queried_at: float = 0.0  # time of the last query
+    heartbeat: Heartbeat = field(default_factory=lambda: Heartbeat("idle", 0.0, 0))
+    heartbeat_at: float = 0.0  # time of the last answer
+    process: dict[str, Any] = field(default_factory=dict)  # the answer of `ready()`
+    node: str | None = None  # Ray's id of the node it runs on or, while it starts, is requested on; None: any node
+
+
+class Workers(contextlib.AbstractContextManager["Workers"]):
+    """The workers of an evaluation, wherever they play. Use it as a context manager, whose end ends them."""
+
+    def __init__(self) -> None:
+        self._workers: list[WorkerHandle] = []
+
+    @property
+    def busy(self) -> bool:
+        return any(worker.jobs for worker in self._workers)
+
+    def kinds(self, *, occupied: bool = True) -> Counter[str]:
+        """Return the number of workers by kind; with `occupied` False, of those without jobs, which may be starting."""
+        return Counter(worker.kind for worker in self._workers if occupied or not worker.jobs)
+
+    def idle(self) -> list[WorkerHandle]:
+        """Return the workers that can take a job."""
+        return [worker for worker in self._workers if worker.starting is None and not worker.jobs]
+
+    @abstractmethod
+    def free_slot(self) -> bool:
+        """Return whether one more worker may start; ends an idle one if there is no room."""
+
+    @abstractmethod
+    def start(self, cell: EvalCase) -> None:
+        """Start one more worker that can play `cell`."""
+
+    @abstractmethod
+    def dispatch(self, worker: WorkerHandle, jobs: tuple[Job, ...]) -> None:
+        """Play `jobs` on `worker`, side by side."""
+
+    @abstractmethod
+    def wait(self, timeout_s: float) -> Iterator[tuple[Job, Report]]:
+        """Yield the reports that arrive within `timeout_s`, also of workers that broke."""
+
+    @abstractmethod
+    def close(self) -> None:
+        """Close the simulators of idle workers, as some need this for a clean exit."""
+
+
+def dispatch(pool: Workers, queue: JobQueue, begin: Callable[[tuple[Job, ...]], None] = lambda _jobs: None) -> None:
+    """Hand waiting jobs to idle workers, and start workers while more are needed; `begin` is called with the jobs."""
+    for worker in pool.idle():
+        working = Counter(one.jobs[0].cell.place for one in pool._workers if one.jobs)
+        if jobs := queue.take(worker.kind, worker.env_place, working):
+            begin(jobs)
+            pool.dispatch(worker, jobs)
+    while (cell := queue.needs_worker(pool.kinds(), pool.kinds(occupied=False))) is not None and pool.free_slot():
+        pool.start(cell)
+
+
+class FailedAttempts:
+    """Decides whether an attempt is repeated, and when too many episodes in a row were lost."""
+
+    def __init__(self, config: EvalConfig) -> None:
+        self._config = config
+        self._lost = 0  # episodes in a row
+        self._policy_errors = 0  # episodes in a row
+
+    def repeats(self, job: Job, failure: Failure) -> bool:
+        """Return whether the episode of a failed attempt is to be played again."""
+        return failure.cause != "user" and job.attempt <= self._config.retries
+
+    def note_played(self) -> None:
+        self._lost = self._policy_errors = 0
+
+    def note_policy_error(self, error: str) -> None:
+        """Note that an error of the policy ended an episode."""
+        self._policy_errors += 1
+        if self._policy_errors == self._config.abort_after:
+            raise PolicyFailed(
+                f"{self._policy_errors} episodes in a row ended by an error of the policy: {error.strip()}; mend the "
+                f"policy and evaluate it with a new --out, or raise abort_after"
+            )
+
+    def note_lost(self, failure: Failure, cure: str) -> None:
+        """Note that an episode was lost, its last attempt to `failure`.
+
+        Raises:
+            VLAgentsError: The failure, if too many episodes in a row were lost; the message ends with the `cure`.
+        """
+        self._lost += 1
+        if self._lost == self._config.abort_after:
+            raise from_code(
+                failure.code, f"{self._lost} episodes in a row lost to infrastructure; {cure}: {failure.message}"
+            )

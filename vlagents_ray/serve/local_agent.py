@@ -1,0 +1,155 @@
+"""A deployment's policy in this process, with the engine of a replica but without Ray."""
+
+from __future__ import annotations
+
+import importlib.metadata
+import uuid
+from collections.abc import Mapping, Sequence
+from concurrent.futures import Future
+from functools import partial
+from typing import Any
+
+from vlagents_ray.contract import Contract
+from vlagents_ray.errors import PolicyFailed
+from vlagents_ray.interface import Act, Agent, Obs
+from vlagents_ray.policies.base.program import Program
+from vlagents_ray.protocol.messages import Reply, Request
+from vlagents_ray.ray_tools.git_state import GitState
+from vlagents_ray.serve.config.deployment import ServerArgs
+from vlagents_ray.serve.engine.engine import Engine
+from vlagents_ray.serve.models.checkpoints import resolved
+from vlagents_ray.serve.python_env.child_agent import make_agent, version_of
+from vlagents_ray.serve.requests import PendingRequest, Rank
+from vlagents_ray.serve.sessions import SessionFinder
+
+_LOOK_S = 0.1  # wait for a checkpoint that another thread loads
+
+
+def build_engine(args: ServerArgs, config: Mapping[str, Any], finder: SessionFinder | None = None) -> Engine:
+    """Create the engine of a deployment, without loading its policy.
+
+    Args:
+        args: The settings, with `environment.process` decided.
+        config: The settings of the policy, with those of the deployment's `user_config`.
+        finder: Fetches sessions from other replicas.
+    """
+    return Engine(
+        args.checkpoints.of(partial(make_agent, args), config),
+        max_batch_size=args.batch.max_size,
+        patience=args.batch.patience,
+        batch_sizes=args.batch.sizes or (),
+        session_limit=args.sessions.limit,
+        session_idle_s=args.sessions.idle_s,
+        version=version_of(args),
+        check=args.dialects.require_fit,
+        limits=args.limits.call_limits(),
+        reply_bytes=args.limits.reply_bytes,
+        in_flight_bytes=args.limits.in_flight_bytes,
+        finder=finder,
+    )
+
+
+def policy_metadata(args: ServerArgs, engine: Engine, code: GitState | None, program: Program) -> dict[str, Any]:
+    """Return the part of a server's metadata that describes its policy; see `ServerArgs.code` for the last two."""
+    contract, models = engine.contract, engine.models
+    return {
+        "policy": args.policy,
+        "checkpoint": resolved(models.config),
+        "weights": models.weights,
+        "devices": models.devices,
+        "policy_version": engine.weights.describe(),
+        "checkpoints": models.describe(),
+        "config": models.config,
+        "contract": None if contract is None else contract.to_json(),
+        "continues_plans": models.continues_plans,
+        "version": importlib.metadata.version("vlagents-ray"),
+        "code": None if code is None else code.to_json(),
+        "program": program | models.files,
+    }
+
+
+class LocalAgent(Agent):
+    """One session of an engine in this process."""
+
+    def __init__(self, engine: Engine) -> None:
+        self._engine = engine
+        self._session = uuid.uuid4().hex
+
+    @property
+    def contract(self) -> Contract | None:
+        return self._engine.contract
+
+    def reset(
+        self, obs: Obs, instruction: str | None, *, contract: dict[str, Any] | None = None, **kwargs: Any
+    ) -> dict[str, Any]:
+        """Begin an episode; with `contract`, the policy's is compared with it first, as a server does."""
+        [reply] = self._replies([self], [Request("reset", obs, instruction, kwargs, contract, rank="simulation")])
+        if reply.error is not None:
+            raise reply.error
+        return reply.info or {}
+
+    def act_batch(self, obs: Sequence[Obs], sessions: Sequence[Agent]) -> list[Act | Exception]:
+        acts: list[Act | Exception] = []
+        for reply in self._replies(sessions, [Request("act", one, rank="simulation") for one in obs]):
+            if reply.act is not None:
+                reply.act.info["timing"] = reply.timing
+            acts.append(reply.error or reply.act or PolicyFailed("act: the policy answered without an action"))
+        return acts
+
+    def act(self, obs: Obs) -> Act:
+        [act] = self.act_batch([obs], [self])
+        if isinstance(act, Exception):
+            raise act
+        return act
+
+    def close(self) -> None:
+        self._replies([self], [Request("close", rank="simulation")])
+
+    def _replies(self, sessions: Sequence[Any], requests: Sequence[Request]) -> list[Reply]:
+        """Return the reply to one request of each session."""
+        answers: list[Future[Reply]] = [Future() for _ in requests]
+        self._engine.submit(
+            [
+                PendingRequest(session._session, request, answer.set_result, Rank.SIMULATION)
+                for session, request, answer in zip(sessions, requests, answers, strict=True)
+            ]
+        )
+        while not self._engine.threaded and not all(answer.done() for answer in answers):
+            if (taken := self._engine.queue.take()) is None:
+                break
+            self._engine.run(taken)
+            if not taken.batch:
+                self._engine.queue.poller.poll(_LOOK_S)
+        return [answer.result() for answer in answers]
+
+
+class LocalPolicy(LocalAgent):
+    """A deployment's policy as an agent, of which `sessions` opens more sessions."""
+
+    def __init__(self, args: ServerArgs, config: Mapping[str, Any], *, threaded: bool = False) -> None:
+        """Set the policy; `initialize` loads it.
+
+        Args:
+            args: The settings; a policy in a Python environment of its own runs in a child process.
+            config: The settings of the policy, with those of the deployment's `user_config`.
+            threaded: Whether a thread runs the policy, in batches of sessions that act at once. By default the caller's
+                does, so that a debugger stops in it.
+        """
+        environment = args.environment.model_copy(update={"process": "child"})
+        super().__init__(build_engine(args.model_copy(update={"environment": environment}), config))
+        self._args, self._code, self._threaded = args, args.code(), threaded
+
+    @property
+    def metadata(self) -> dict[str, Any]:
+        """The metadata of the policy, as `RemoteAgent.metadata`."""
+        return policy_metadata(self._args, self._engine, *self._code)
+
+    def initialize(self) -> None:
+        self._engine.start(threaded=self._threaded)
+
+    def sessions(self, n: int) -> list[LocalAgent]:
+        """Open `n` more sessions, for `act_batch` of this agent; close each of them."""
+        return [LocalAgent(self._engine) for _ in range(n)]
+
+    def close(self) -> None:
+        self._engine.close()
