@@ -322,6 +322,8 @@ class _Suite:
 
     def _check_limits(self, obs: Obs) -> None:
         layout, limits = self._layout, getattr(self._robot, "joint_limits", None)
+        if any(finding.check == "units" for finding in self.report.findings):
+            return
         if layout is None or limits is None:
             self.report.skipped["limits"] = "the robot has no `joint_limits`, or no state of its joints"
             return
@@ -329,6 +331,7 @@ class _Suite:
             if not low <= measured <= high:
                 got, want = f"{name} at {measured:.4g}", f"[{low:.4g}, {high:.4g}]"
                 self.find("limits", got, want, "give the limits of this arm, in the order and unit of its joints")
+                break
         self._passes("limits")
 
     def _check_stop(self) -> None:
@@ -394,16 +397,15 @@ class _Suite:
             self.find("cameras", side, want, "rotate or flip the picture in observe: it must be upright, not mirrored")
 
     def _check_place(self, obs: Obs) -> None:
-        arms = self._contract.action.arms or ("",)
-        for number, arm in enumerate(arms):
-            pose = next((obs.state[key] for key in _parts(arm, "tquat", "xyzrpy") if key in obs.state), None)
-            sees = None if pose is None or self._operator is None else self._operator.sees_hand(pose[:3], number)
-            if sees is None:
-                self.report.skipped["place"] = "observations have no pose of the hand, or the operator cannot tell"
-            elif not sees and not any(one.check == "units" for one in self.report.findings):
-                got = f"the hand at {np.round(pose[:3], 3).tolist()} m, where it is not" if pose is not None else ""
-                cure = "the frame is turned or moved: give the pose in the frame of the arm's base"
-                self.find("place", got, "x forwards, y to the left, z up from the base", cure)
+        for number, arm in enumerate(self._contract.action.arms or ("",)):
+            pose = obs.state.get(_part(arm, "tquat"))
+            sees = None if pose is None or self._operator is None else self._operator.sees_hand(pose, number)
+            if pose is None or sees is None:
+                self.report.skipped["place"] = "observations have no 'tquat', or the operator cannot tell"
+            elif not sees and not self.report.findings:
+                got = f"the hand at {np.round(pose[:3], 2)} m with the quaternion {np.round(pose[3:], 2)}, as it is not"
+                cure = "give the pose in the frame of the arm's base, x forwards and z up, and the quaternion as xyzw"
+                self.find("place", got, "the pose that the operator sees", cure)
         self._passes("place")
 
     def _hold_command(self, layout: _Layout, obs: Obs) -> np.ndarray:
@@ -519,8 +521,8 @@ class _Suite:
         if abs(angle - change) > 0.3 * change + 0.01:
             got = f"the hand turned by {angle:.3g} rad for {change:.3g} rad of {self._names()[joint]}"
             self.find("pose", got, "the same angle", "correct the rotation of the pose, or the unit of the joints")
-        # The tolerance is for what other joints give way: 2 mm, and a third of the hand's way.
-        if along > 0.002 + 0.35 * float(np.linalg.norm(p1 - p0)):
+        # The tolerance is for what other joints give way: 1 mm, and a sixth of the hand's way.
+        if along > 0.001 + float(np.linalg.norm(p1 - p0)) / 6:
             got = f"a hand that moved {1e3 * along:.2g} mm along the axis about which it turned"
             self.find("pose", got, "a motion about the joint's axis", "give the quaternion as xyzw, not as wxyz")
 
@@ -589,7 +591,7 @@ class _Layout:
         action: ActionSpec = contract.action
         if action.space not in (None, "joint") or action.dim is None:
             return None
-        parts = [key for arm in action.arms or ("",) for key in _parts(arm, "joints") if key in obs.state]
+        parts = [key for arm in action.arms or ("",) if (key := _part(arm, "joints")) in obs.state]
         counts = [len(obs.state[part]) for part in parts]
         each = (action.dim - sum(counts)) // max(1, len(parts))
         if not parts or each not in (0, 1) or sum(counts) + each * len(parts) != action.dim:
@@ -644,9 +646,9 @@ def _card(before: np.ndarray, after: np.ndarray) -> _Card | None:
     return _Card(larger is masks[0], columns.mean() / width, rows.mean() / height, len(rows) / larger.size)
 
 
-def _parts(arm: str, *names: str) -> list[str]:
-    """Return the names of parts of the state for an arm; "" is the only one."""
-    return [f"{arm}/{name}" if arm else name for name in names]
+def _part(arm: str, name: str) -> str:
+    """Return the name of a part of the state for an arm; "" is the only one."""
+    return f"{arm}/{name}" if arm else name
 
 
 def _times(a: np.ndarray, b: np.ndarray) -> np.ndarray:

@@ -127,6 +127,7 @@ class MujocoArm:
         self.arms = stated.arms or ("",)
         self._latency_s, self._size, self._frame_s = latency_s, size, 1 / fps
         self._queue: deque[tuple[float, np.ndarray]] = deque()
+        self._goal = self._target = np.zeros(0)  # the commanded targets, and those on the way to them at `speed`
         self._renderer: Any = None
         self._pictures: dict[str, np.ndarray] = {}
         self._pictures_s = -np.inf
@@ -465,6 +466,7 @@ class SimulatedOperator:
         """Return whether the gripper is nearly closed."""
         return self._arm.opening() < 0.5
 
-    def sees_hand(self, position: np.ndarray, arm: int = 0) -> bool | None:
-        """Return whether the hand is within 10 cm of a position in the base frame, m."""
-        return bool(np.linalg.norm(self._arm.hand_pose(arm)[:3] - position) < 0.1)
+    def sees_hand(self, pose: np.ndarray, arm: int = 0) -> bool | None:
+        """Return whether the hand is within 10 cm and about 25° of a pose in the frame of its base."""
+        true = self._arm.hand_pose(arm)
+        return bool(np.linalg.norm(true[:3] - pose[:3]) < 0.1 and abs(true[3:] @ pose[3:]) > 0.975)
