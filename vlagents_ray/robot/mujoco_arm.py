@@ -407,7 +407,13 @@ def _read(mujoco: Any, stated: ArmModel, model: str) -> Any:
                 f"MJCF or URDF file{did_you_mean(model, [*ARMS, *known])}"
             )
         robot = menagerie.get(stated.menagerie)
-        return robot.spec(robot.default_model)
+        try:
+            return robot.spec(robot.default_model)
+        except menagerie.MenagerieError as error:
+            cure = "without a network, MENAGERIE_ROOT names a folder with the models, or give the path of a file"
+            raise ConfigError(
+                f"arm {model!r}: the MuJoCo Menagerie has no file of it here ({error}); {cure}"
+            ) from error
     if not file.is_file():
         raise ConfigError(f"arm: got {model!r}, want a file that exists")
     if file.suffix != ".urdf":
