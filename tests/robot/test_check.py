@@ -86,7 +86,13 @@ class Reluctant(SimulatedOperator):
 
 
 class Blind(SimulatedOperator):
-    """Cannot tell the pose of the hand."""
+    """Cannot tell the pose of the hand, nor what moves."""
+
+    def saw_joint(self, name: str, side: int) -> bool | None:
+        return None
+
+    def saw_closing(self) -> bool | None:
+        return None
 
     def sees_hand(self, pose: np.ndarray, arm: int = 0) -> bool | None:
         return None
@@ -97,6 +103,14 @@ def test_motion_shows_a_wrong_quaternion_that_the_operator_cannot_see() -> None:
         report = examine(QuaternionOrder(arm), operator=Blind(arm), clock=arm.clock)
     assert [finding.check for finding in report.findings] == ["pose"]
     assert "cannot tell" in report.skipped["place"]
+
+
+def test_what_nobody_saw_is_not_checked() -> None:
+    with closing(simulated_arm("franka")) as arm:
+        report = examine(arm, operator=Blind(arm), clock=arm.clock)
+    assert report.ok
+    assert set(report.skipped) == {"order", "sign", "place", "gripper"}
+    assert "could not tell whether panda_joint7 moved" in report.skipped["order"]
 
 
 class Counting(FaultyArm):

@@ -37,9 +37,9 @@ class TerminalOperator:
             return _asked("Take the card away. Done?") is True
         return _asked(f"Hold something red in the upper left quarter of what camera {camera!r} sees. Done?") is True
 
-    def saw_joint(self, name: str) -> bool | None:
+    def saw_joint(self, name: str, side: int) -> bool | None:
         """Ask which joint moved."""
-        return _asked(f"Did {name} alone move, to the side that its manual calls positive?")
+        return _asked(f"Did {name} alone move, to the side that its manual calls {'+' if side > 0 else '-'}?")
 
     def saw_closing(self) -> bool | None:
         """Ask for the gripper."""

@@ -58,8 +58,8 @@ class Operator(Protocol):
     def holds_card(self, camera: str | None) -> bool:
         """Hold something red in the upper left quarter of what a camera sees; None: take it away. False: no card."""
 
-    def saw_joint(self, name: str) -> bool | None:
-        """Return whether this joint alone has moved since `agrees`, towards its positive side."""
+    def saw_joint(self, name: str, side: int) -> bool | None:
+        """Return whether this joint alone has moved since `agrees`, towards its positive (1) or negative (-1) side."""
 
     def saw_closing(self) -> bool | None:
         """Return whether the gripper is closed now."""
@@ -427,25 +427,20 @@ class _Suite:
             self._clock.sleep(0.01)
             moved = layout.measured(self._observe()) - start
             if np.abs(moved).max() > _RUNAWAY * layout.step:
-                got = (
-                    f"a motion of {self._names()[int(np.argmax(np.abs(moved)))]} by {np.abs(moved).max():.3g} and more"
-                )
+                most = int(np.argmax(np.abs(moved)))
+                got = f"a motion of {self._names()[most]} by {moved[most]:+.3g} and more"
                 kind = "absolute targets" if layout.relative else "deltas"
                 cure = f"the arm takes {kind}, or other units: correct apply, or action.delta of the contract"
                 self.find("meaning", got, "none at the command of the present pose", cure)
 
     def _ramp(self, layout: _Layout, joint: int, change: float) -> list[tuple[float, np.ndarray]]:
         """Move a joint by `change`; return times and measured joints during the move and until it is over."""
-        start = self._command.copy()
         base = layout.measured(self._observe())
         ticks = max(1, round(_RAMP_S / self._period_s))
         seen = []
         for tick in range(1, ticks + round(_HOLD_S / self._period_s) + 1):
             if tick <= ticks:
-                action = np.where(layout.held, start, 0) if layout.relative else start.copy()
-                share = 1 if layout.relative else tick
-                action[layout.joints[joint]] += change * share / ticks
-                self._apply(action)
+                self._apply(layout.changed(self._command, joint, change / ticks))
             self._clock.sleep(self._period_s)
             measured = layout.measured(self._observe())
             seen.append((self._clock.monotonic(), measured))
@@ -463,10 +458,18 @@ class _Suite:
         after = self._observe()
         moved = layout.measured(after) - base
         self._judge_move(layout, joint, change, moved)
-        saw = self._operator.saw_joint(name) if self._operator is not None and change > 0 else None
+        saw = self._operator.saw_joint(name, 1 if room else -1) if self._operator is not None else None
+        if saw is None:
+            reason = f"command and reading agree, but the operator could not tell whether {name} moved"
+            self.report.skipped |= {"order": reason, "sign": reason}
         if saw is False:
             cure = "correct the order or the sign of the joints, in observe and in apply"
-            self.find("order", f"another joint, or another side, when {name} was commanded", f"{name} to its +", cure)
+            self.find(
+                "order",
+                f"another joint, or another side, when {name} was commanded",
+                f"{name} alone, {change:+g}",
+                cure,
+            )
         half = [at for at, measured in seen if (measured[joint] - base[joint]) / change >= 0.5]
         self._lags_s.append((half[0] if half else np.inf) - began_s - _RAMP_S / 2)
         if self._lags_s[-1] > self._latency_s:
@@ -527,12 +530,10 @@ class _Suite:
             self.find("pose", got, "a motion about the joint's axis", "give the quaternion as xyzw, not as wxyz")
 
     def _check_single_commands(self, layout: _Layout, name: str) -> None:
-        joint, half = layout.joints[0], layout.step / 2
+        half = layout.step / 2
         for number in range(6):
             before = layout.measured(self._observe())[0]
-            action = np.where(layout.held, self._command, 0) if layout.relative else self._command.copy()
-            action[joint] += half if number % 2 == 0 else -half
-            self._apply(action)
+            self._apply(layout.changed(self._command, 0, half if number % 2 == 0 else -half))
             self._clock.sleep(2 * self._latency_s)
             if abs(layout.measured(self._observe())[0] - before) < 0.4 * half:
                 got = f"no motion of {name} at command {number + 1} of 6 single ones"
@@ -540,9 +541,7 @@ class _Suite:
 
     def _check_stop_in_motion(self, layout: _Layout, name: str) -> None:
         before = layout.measured(self._observe())[0]
-        action = np.where(layout.held, self._command, 0) if layout.relative else self._command.copy()
-        action[layout.joints[0]] += layout.step
-        self._apply(action)
+        self._apply(layout.changed(self._command, 0, layout.step))
         self._robot.stop()
         self._clock.sleep(2 * self._latency_s)
         moved = abs(layout.measured(self._observe())[0] - before)
@@ -566,6 +565,8 @@ class _Suite:
             self._clock.sleep(2.0)
             openings.append(self._observe().gripper or 0.0)
             saw = self._operator.saw_closing() if self._operator is not None and goal == spec.gripper_closed else None
+            if len(openings) == 2 and saw is None:
+                self.report.skipped["gripper"] = "the operator could not tell whether it closed"
             if len(openings) == 2 and (openings[1] > openings[0] - 0.3 or saw is False):
                 got = f"an opening of {openings[0]:.2g} before and {openings[1]:.2g} after the command to close"
                 cure = "exchange gripper_open and gripper_closed of the contract, and give 1 for open in observe"
@@ -613,10 +614,13 @@ class _Layout:
         """The size of a small move, in the unit of the joints."""
         return _STEPS.get(self.unit, _OTHER_STEP)
 
-    @property
-    def held(self) -> np.ndarray:
-        """Which numbers of an action are absolute even among deltas: the grippers, (dim,) bool."""
-        return np.isin(np.arange(self.dim), self.grippers)
+    def changed(self, last: np.ndarray, joint: int, change: float) -> np.ndarray:
+        """Return the action that moves one joint by `change` from where the `last` action, (dim,), put it."""
+        action = last.copy()
+        if self.relative:
+            action[self.joints] = 0
+        action[self.joints[joint]] += change
+        return action
 
     def measured(self, obs: Obs) -> np.ndarray:
         """Return the measured joints in the order of an action, (D,)."""

@@ -462,11 +462,11 @@ class SimulatedOperator:
         self._arm.hold_card(camera)
         return True
 
-    def saw_joint(self, name: str) -> bool | None:
-        """Return whether that joint alone has moved towards its positive side since the person agreed."""
+    def saw_joint(self, name: str, side: int) -> bool | None:
+        """Return whether that joint has moved most since the person agreed, towards a side, 1 or -1."""
         moved = self._arm.joints() - self._before
         most = int(np.argmax(np.abs(moved)))
-        return self._arm.joint_names[most] == name and bool(moved[most] > 0)
+        return self._arm.joint_names[most] == name and bool(moved[most] * side > 0)
 
     def saw_closing(self) -> bool | None:
         """Return whether the gripper is nearly closed."""

@@ -51,7 +51,7 @@ def hardware(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 class Person:
-    """Agrees to all motions, holds no card, and cannot tell what moved."""
+    """Agrees to all motions, sees each joint move, and holds no card."""
 
     def agrees(self, motion: str) -> bool:
         return True
@@ -59,8 +59,8 @@ class Person:
     def holds_card(self, camera: str | None) -> bool:
         return False
 
-    def saw_joint(self, name: str) -> None:
-        return None
+    def saw_joint(self, name: str, side: int) -> bool:
+        return True
 
     def saw_closing(self) -> None:
         return None
