@@ -41,7 +41,7 @@ class LeRobotRobot:
                     importlib.import_module(f"{folder.__name__}.{module.name}")  # registers its configurations
         require("lerobot.utils.import_utils").register_third_party_plugins()
         try:
-            config = require("draccus").decode(package.RobotConfig, {"type": kind, **settings})
+            config = importlib.import_module("draccus").decode(package.RobotConfig, {"type": kind, **settings})
             self._robot = require("lerobot.robots.utils").make_robot_from_config(config)
         except Exception as error:
             near = did_you_mean(kind, package.RobotConfig.get_known_choices())

@@ -11,7 +11,6 @@ from vlagents_ray.robot.check import examine
 from vlagents_ray.robot.mujoco_arm import SimulatedClock
 from vlagents_ray.robot.named import robot_named
 
-
 SPEED = 90.0  # deg/s of the motors
 CLOCK = SimulatedClock()
 
@@ -46,7 +45,7 @@ class Bus:
 @pytest.fixture(autouse=True)
 def hardware(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(so_follower, "FeetechMotorsBus", Bus)
-    monkeypatch.setattr(so_follower.SOFollower, "configure", lambda self: None)
+    monkeypatch.setattr(so_follower.SOFollower, "configure", lambda _: None)
     monkeypatch.setattr(lerobot_robot, "time", CLOCK)
 
 
