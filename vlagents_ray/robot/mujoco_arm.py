@@ -370,7 +370,12 @@ class MujocoArm:
             joint = self.model.joint(int(self.model.actuator_trnid[index, 0])).name if of_joint else ""
             name = self.model.actuator(index).name or joint
             number = next((i for i, arm in enumerate(self.arms) if arm and arm in f"{name} {joint}"), 0)
+            if self.model.actuator_biasprm[index, 1] == 0:
+                raise ConfigError(f"{stated.menagerie}: actuator {name!r} has no position controller, want one each")
             low, high = (float(end) for end in self.model.actuator_ctrlrange[index])
+            if of_joint and low >= high:  # not limited
+                joint_range = self.model.jnt_range[self.model.actuator_trnid[index, 0]]
+                low, high = map(float, joint_range if joint_range[0] < joint_range[1] else (-2 * np.pi, 2 * np.pi))
             if _GRIPPER.search(name) or _GRIPPER.search(joint) or not of_joint:
                 # Of two fingers that move against each other, one has its open end where its number is small.
                 rising = stated.open_high if abs(high) >= abs(low) else not stated.open_high
