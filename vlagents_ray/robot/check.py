@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import base64
 import html
-import threading
 import time
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Protocol
@@ -170,27 +170,23 @@ class _FoundInMotionError(Exception):
     """Ends the check, as a finding in motion was reported."""
 
 
+@dataclass
 class _Suite:
-    def __init__(
-        self,
-        robot: Robot,
-        contract: Contract,
-        operator: Operator | None,
-        period_s: float,
-        latency_s: float,
-        clock: Any,
-    ) -> None:
-        self.report = RobotReport()
-        self._robot, self._contract, self._operator = robot, contract, operator
-        self._period_s, self._latency_s, self._clock = period_s, latency_s, clock
-        self._when = ""  # the present motion; empty at rest
-        self._stamp_s = -np.inf
-        self._stamped = True  # time stamps were right so far
-        self._observe_s: list[float] = []
-        self._apply_s: list[float] = []
-        self._lags_s: list[float] = []
-        self._command = np.zeros(0)  # the last action
-        self._layout: _Layout | None = None
+    _robot: Robot
+    _contract: Contract
+    _operator: Operator | None
+    _period_s: float
+    _latency_s: float
+    _clock: Any
+    report: RobotReport = field(default_factory=RobotReport)
+    _when: str = ""  # the present motion; empty at rest
+    _stamp_s: float = -np.inf
+    _stamped: bool = True  # time stamps were right so far
+    _observe_s: list[float] = field(default_factory=list)
+    _apply_s: list[float] = field(default_factory=list)
+    _lags_s: list[float] = field(default_factory=list)
+    _command: np.ndarray = field(default_factory=lambda: np.zeros(0))  # the last action
+    _layout: _Layout | None = None
 
     def find(self, check: str, got: str, want: str, cure: str, *, ends: bool = True) -> None:
         """Report a finding; one in motion stops the robot and ends the check."""
@@ -232,9 +228,8 @@ class _Suite:
             reason = "no operator agreed to a motion"
         elif action.relative is None or self._layout is None:
             reason = "the contract states no joint targets or deltas (action.dim, space, delta) beside their state"
-        for name in CHECKS if reason else ():
-            if name not in self.report.passed:
-                self.report.skipped.setdefault(name, reason)
+        if reason:
+            self._skip_others(reason)
         return not reason
 
     def in_motion(self) -> None:
@@ -262,10 +257,13 @@ class _Suite:
         if self._operator is not None and self._operator.agrees(motion):
             self._when = motion
             return True
+        self._skip_others(f"the operator did not agree to {motion}")
+        return False
+
+    def _skip_others(self, reason: str) -> None:
         for name in CHECKS:
             if name not in self.report.passed:
-                self.report.skipped.setdefault(name, f"the operator did not agree to {motion}")
-        return False
+                self.report.skipped.setdefault(name, reason)
 
     def _passes(self, *checks: str) -> None:
         found = {finding.check for finding in self.report.findings} | self.report.skipped.keys()
@@ -348,21 +346,8 @@ class _Suite:
                 return
 
     def _in_thread(self) -> None:
-        errors: list[Exception] = []
-
-        def stop() -> None:
-            try:
-                self._robot.stop()
-            except Exception as error:  # noqa: BLE001 - raised by the caller
-                errors.append(error)
-
-        thread = threading.Thread(target=stop, daemon=True)
-        thread.start()
-        thread.join(_STOP_S * 5)
-        if errors:
-            raise errors[0]
-        if thread.is_alive():
-            raise TimeoutError(f"not returned after {_STOP_S * 5} s")
+        with ThreadPoolExecutor(1) as thread:
+            thread.submit(self._robot.stop).result()
 
     def _check_cameras(self) -> None:
         before = self._observe().cameras

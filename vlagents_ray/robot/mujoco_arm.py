@@ -298,14 +298,9 @@ class MujocoArm:
         mujoco = self._mujoco
         spec.stat.extent, spec.visual.map.znear = 1.0, 0.01  # the card is shown from 1 cm on
         spec.add_texture(
-            name=_PREFIX + "tiles",
-            type=mujoco.mjtTexture.mjTEXTURE_2D,
-            builtin=mujoco.mjtBuiltin.mjBUILTIN_CHECKER,
-            rgb1=[0.35, 0.35, 0.35],
-            rgb2=[0.55, 0.55, 0.5],
-            width=64,
-            height=64,
-        )
+            name=_PREFIX + "tiles", type=mujoco.mjtTexture.mjTEXTURE_2D, builtin=mujoco.mjtBuiltin.mjBUILTIN_CHECKER,
+            rgb1=[0.35, 0.35, 0.35], rgb2=[0.55, 0.55, 0.5], width=64, height=64,
+        )  # fmt: skip
         tiles = spec.add_material(name=_PREFIX + "tiles", texrepeat=[5, 5], texuniform=True)
         tiles.textures[mujoco.mjtTextureRole.mjTEXROLE_RGB] = _PREFIX + "tiles"
         world = spec.worldbody
