@@ -2,14 +2,17 @@
 
 from collections.abc import Iterator
 from contextlib import closing, contextmanager
+from pathlib import Path
 
 import numpy as np
 import pytest
-from arm_models import ARMS, simulated_arm
-from faulty_arms import FAULTS, Fault, FaultyArm, QuaternionOrder
+from arm_models import ARMS, model_file, simulated_arm
+from faulty_arms import FAULTS, ClockStep, Fault, FaultyArm, QuaternionOrder
 
+from vlagents_ray.cli.robot_check import TerminalOperator, main
 from vlagents_ray.robot.check import CHECKS, RobotReport, examine
 from vlagents_ray.robot.mujoco_arm import MujocoArm, SimulatedOperator
+from vlagents_ray.testing import ContractViolation, check_robot
 
 pytestmark = pytest.mark.sim
 HARM = 0.35  # rad, about 20°: no joint may have been farther from its rest pose
@@ -138,10 +141,49 @@ def test_nothing_is_commanded_unless_the_operator_agrees() -> None:
     assert "panda_joint2" in report.skipped["gripper"]
 
 
-def test_the_report_has_pictures_and_no_links(tmp_path) -> None:
+def test_the_report_has_pictures_and_no_links(tmp_path: Path) -> None:
     with closing(simulated_arm("franka")) as arm:
         report = examine(arm, operator=Reluctant(arm, 0), clock=arm.clock)
     report.write(tmp_path / "report.html")
     page = (tmp_path / "report.html").read_text()
     assert page.count("<img") == len(report.pictures) == 4
     assert "http" not in page
+
+
+def test_check_robot_raises_every_finding() -> None:
+    with closing(simulated_arm("franka")) as arm:
+        assert check_robot(arm, clock=arm.clock).ok
+        with pytest.raises(ContractViolation, match="clock: got a time stamp"):
+            check_robot(ClockStep(arm), clock=arm.clock)
+
+
+@pytest.mark.parametrize("status", [0, 2])
+def test_the_command_checks_a_simulated_arm_without_a_person(
+    status: int, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    page = tmp_path / "report.html"
+    name = f"mujoco:{model_file('franka')}" if status == 0 else "mujoco:missing.xml"
+    assert main([name, "--robot-set", "like=franka", "--robot-set", "fps=5", "--report", str(page)]) == status
+    said = capsys.readouterr()
+    assert ("ok gripper" in said.out, page.exists(), "ConfigError" in said.err) == ((status == 0,) * 2 + (status == 2,))
+
+
+def test_a_person_is_asked_before_each_motion(monkeypatch: pytest.MonkeyPatch) -> None:
+    asked, answers = list[str](), iter(["y", "n", "", "y"])
+    monkeypatch.setattr("builtins.input", lambda question: asked.append(question) or next(answers))
+    person = TerminalOperator(move=True)
+    assert person.agrees("a move of elbow by 0.05 rad and back")
+    assert "a move of elbow by 0.05 rad and back. Is its space free?" in asked[0]
+    assert person.saw_joint("elbow", -1) is False
+    assert "calls -?" in asked[1]
+    assert person.saw_closing() is None
+    assert not TerminalOperator(move=False).agrees("anything")
+    assert len(asked) == 3
+
+
+def test_without_a_terminal_nothing_is_agreed(monkeypatch: pytest.MonkeyPatch) -> None:
+    def closed(_: str) -> str:
+        raise EOFError
+
+    monkeypatch.setattr("builtins.input", closed)
+    assert not TerminalOperator(move=True).agrees("a move")

@@ -29,14 +29,14 @@ class Bus:
     def disconnect(self, disable_torque: bool = True) -> None:
         self.is_connected = False
 
-    def sync_read(self, name: str) -> dict[str, float]:
+    def sync_read(self, name: str, **options: object) -> dict[str, float]:
         assert name == "Present_Position"
         most, self.at_s = SPEED * (CLOCK.monotonic() - self.at_s), CLOCK.monotonic()
         for motor, goal in self.goals.items():
             self.positions[motor] += float(np.clip(goal - self.positions[motor], -most, most))
         return dict(self.positions)
 
-    def sync_write(self, name: str, goals: dict[str, float]) -> None:
+    def sync_write(self, name: str, goals: dict[str, float], **options: object) -> None:
         assert name == "Goal_Position"
         self.sync_read("Present_Position")
         self.goals |= goals
