@@ -2,6 +2,8 @@
 
 With --env a simulation is driven: by a policy, by an operator, or by a policy that an operator corrects.
 
+`vlagents-ray robot check ROBOT` checks a robot before a policy moves it.
+
 Exit status: 0 if every tick had an action of the policy, 1 if not, 3 if fewer than half had, 2 if it could not run.
 """
 
@@ -27,7 +29,8 @@ from vlagents_ray.errors import ConfigError, VLAgentsError
 from vlagents_ray.interface import Agent, Obs
 from vlagents_ray.robot.fit import Trained, require_fit
 from vlagents_ray.robot.limits import Limits
-from vlagents_ray.robot.loop import ROBOT, LoopReport, Restart, Robot, import_class, run_loop
+from vlagents_ray.robot.loop import LoopReport, Restart, Robot, import_class, run_loop
+from vlagents_ray.robot.named import robot_named
 from vlagents_ray.robot.record import Recorder
 from vlagents_ray.robot.ros import RosRobot, read_settings
 from vlagents_ray.robot.safety import SOFT_START_S, Guard, Watchdog, measured_state
@@ -45,7 +48,12 @@ _HEADER = ("", "ticks", "missed", "within 2 ms", "p50 ms", "p99 ms", "max ms")
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command, and return its exit status."""
-    options = parse(arguments)
+    given = sys.argv[1:] if arguments is None else arguments
+    if given[:1] == ["check"]:
+        from vlagents_ray.cli.robot_check import main as check
+
+        return check(given[1:])
+    options = parse(given)
     if options.env is not None:
         from vlagents_ray.cli.simulated_robot import drive
 
@@ -103,7 +111,7 @@ def _run(options: argparse.Namespace) -> LoopReport:
     deadline_s = 0.0 if options.mode == "async" else WAIT_S
     if options.deadline_ms is not None:
         deadline_s = options.deadline_ms / 1e3
-    make_robot = import_class("--robot", options.robot, ROBOT) if options.robot else None
+    make_robot = robot_named("--robot", options.robot, options.robot_set) if options.robot else None
     make_leader = import_class("--leader", options.leader) if ":" in (options.leader or "") else None
     with contextlib.ExitStack() as stack:
         topics = None if options.ros is None else stack.enter_context(RosRobot(read_settings(options.ros)))
@@ -134,6 +142,7 @@ def _run(options: argparse.Namespace) -> LoopReport:
         player = stack.enter_context(ChunkPlayer(agent, settings, check=guard, override=leader))
         player.initialize()  # refuses unfit settings before anything is timed or moves
         robot: Robot = topics or (SimulatedRobot(contract) if make_robot is None else make_robot())
+        stack.callback(getattr(robot, "close", lambda: None))
         if options.trained_on is not None:
             _require_fit(options, agent, robot.observe(), limits)
         recorder = None
@@ -297,7 +306,9 @@ def command_parser() -> tuple[argparse.ArgumentParser, list[argparse.Action], li
     add("--hz", type=seconds, help=f"control rate (default: {_HZ:g}, or the environment's)")
     real("--seconds", type=seconds, default=60.0, help="how long (%(default)s)")
     real("--instruction", help="the task in words")
-    real("--robot", metavar="MODULE:CLASS", help="your robot's class, without arguments; default: a simulated one")
+    robots = "your robot's class, lerobot:TYPE or mujoco:ARM; default: a simulated one; see also `robot check --help`"
+    real("--robot", metavar="MODULE:CLASS", help=robots)
+    real("--robot-set", metavar="KEY=VALUE", action="append", default=[], help="an argument of the robot, repeatable")
     real("--ros", metavar="FILE", help="a robot behind topics of ROS 2, from this file; see docs/ros.md")
     leaders = "device for taking over: keyboard, spacemouse, or, without --env, your MODULE:CLASS, see Leader"
     add("--leader", metavar="LEADER", help=leaders)
