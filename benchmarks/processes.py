@@ -17,6 +17,7 @@ DAEMONS = frozenset(
     | {"default_worker.py", "dashboard.py", "agent.py", "main.py", "monitor.py", "log_monitor.py"}
 )
 _IDLE_S = 3.0
+_POLLING_CORES = 0.25  # of an idle process; one that waits for events or a timer takes less than 0.02
 _SWITCHES = re.compile(r"ctxt_switches:\t(\d+)")  # voluntary ones, then involuntary ones
 
 
@@ -92,10 +93,14 @@ class UsageMeter:
         self._seconds += time.monotonic() - begun
 
     def mark_idle(self) -> float:
-        """Take what was counted so far as the use while idle; returns its CPU s in a second."""
-        self._idle = self._used / self._seconds
+        """Take what was counted so far as the use while idle; returns its CPU s in a second.
+
+        What a process that polls uses is all counted: polling takes a core that no act beside it could have.
+        """
+        idle = self._used / self._seconds
         self._seconds, self._used = 0.0, np.zeros_like(self._used)
-        return float(self._idle[:, 0].sum())
+        self._idle = np.where(idle[:, :1] > _POLLING_CORES, 0, idle)
+        return float(idle[:, 0].sum())
 
     def per_act(self, acts: int) -> dict[str, Any]:
         """Return the use for each of `acts` acts as JSON values, and its CPU time by program, ms."""

@@ -8,6 +8,7 @@ from __future__ import annotations
 import json
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -21,6 +22,7 @@ from benchmarks.peers import PYTHON, PeersPython
 from benchmarks.picture import plot_league
 from benchmarks.rtt import measure_with_peers
 from benchmarks.throughput import WITHOUT_GAIN, ThroughputPlan, measure_throughput
+from vlagents_ray.bench.line_process import ProcessFailed
 from vlagents_ray.cli.console import errors, out, progress, table
 from vlagents_ray.errors import ConfigError
 from vlagents_ray.registry import require
@@ -56,14 +58,18 @@ def collect(
     }
     results["rtt"] = measure_with_peers(calls, peers=["all"], peers_python=peers_python, progress=progress)
     results["versions"] |= results["rtt"]["versions"]
-    try:
-        results["link"] = link.measure_link(link_calls, peers=link.PEERS, peers_python=peers_python, progress=progress)
-    except ConfigError as error:
-        progress(str(error))
-        results["skipped"]["link"] = str(error)
     plan = plan or ThroughputPlan(peers=["all"], peers_python=peers_python)
-    results["throughput"] = measure_throughput(plan, progress)
-    results["without_gain"] = measure_throughput(replace(plan, config=WITHOUT_GAIN, batch=1), progress)
+    parts = {
+        "link": partial(link.measure_link, link_calls, peers=link.PEERS, peers_python=peers_python, progress=progress),
+        "throughput": partial(measure_throughput, plan, progress),
+        "without_gain": partial(measure_throughput, replace(plan, config=WITHOUT_GAIN, batch=1), progress),
+    }
+    for name, part in parts.items():
+        try:
+            results[name] = part()
+        except (ConfigError, ProcessFailed) as error:  # the other parts are kept
+            progress(str(error))
+            results["skipped"][name] = str(error).partition("\n")[0]
     return results
 
 

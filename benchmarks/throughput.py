@@ -185,7 +185,7 @@ def peer_fleet(
         server = stack.enter_context(others.serving(client, plan.peers_python, running, policy))
         words = [*client.command(plan.peers_python), "load", *server.address, str(obs), client.mode, json.dumps(policy)]
         children = [
-            stack.enter_context(LineProcess(f"clients of {client.name}", [*words, *map(str, part)], others.ALONE))
+            stack.enter_context(LineProcess(f"clients of {client.name}", [*words, *map(str, part)], others.alone()))
             for part in ([(1, most)] if client.one_process else _parts(most))
         ]
         for child in children:

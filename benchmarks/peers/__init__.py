@@ -99,8 +99,14 @@ PEER_CLIENTS = (
 )  # fmt: skip
 PEERS = tuple(dict.fromkeys(one.peer for one in PEER_CLIENTS))
 Policy = Mapping[str, float]  # arguments of `peer.Policy`
-ALONE = {"PYTHONPATH": ""}  # nothing of ours in a peer's environment
+_NO_STATISTICS = "RAY_USAGE_STATS_ENABLED"
 READY_S = 240.0  # some import torch, or start Ray, several processes at once
+
+
+def alone() -> dict[str, str | None]:
+    """Return the changes of a peer's environment variables: none of ours, as those of a running server's HAProxy."""
+    ours = [name for name in os.environ if name.startswith(("RAY_", "VLAGENTS_RAY_")) and name != _NO_STATISTICS]
+    return {"PYTHONPATH": "", **dict.fromkeys(ours)}
 
 
 def peer_clients(names: Sequence[str], python: Path) -> tuple[list[PeerClient], dict[str, str], dict[str, str]]:
@@ -180,7 +186,7 @@ class _PeerDriver(ClientProcess):
     """A client whose server runs in its turns."""
 
     def __init__(self, server: PeerServer, name: str, command: Sequence[str]) -> None:
-        super().__init__(name, command, ALONE)
+        super().__init__(name, command, alone())
         self._server = server
 
     def ready(self) -> dict[str, Any]:
@@ -206,7 +212,7 @@ def serving(
         process = None
         if client.server:
             command = [*client.command(python), "serve", *address, json.dumps(dict(policy))]
-            process = stack.enter_context(LineProcess(f"{client.name}, server", command, ALONE))
+            process = stack.enter_context(LineProcess(f"{client.name}, server", command, alone()))
         server = PeerServer(address, process, client.polls)
         if client.shares:
             running[client.script] = server

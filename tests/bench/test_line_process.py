@@ -21,3 +21,11 @@ def test_silence_and_nonsense_are_errors() -> None:
         mute.read(0.1)
     with LineProcess("talker", ["echo", "hello"]) as talker, pytest.raises(ProcessFailed, match="want a line of JSON"):
         talker.read(10)
+
+
+def test_variables_are_added_and_removed(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("KEPT", "1")
+    monkeypatch.setenv("GONE", "1")
+    command = ["sh", "-c", 'echo \\"$KEPT/${GONE-unset}/$NEW\\"']
+    with LineProcess("variables", command, {"GONE": None, "NEW": "2"}) as child:
+        assert child.read(10) == "1/unset/2"

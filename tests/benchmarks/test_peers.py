@@ -21,6 +21,7 @@ from benchmarks.peers import (
     SCRIPTS,
     PeerClient,
     PeerServer,
+    alone,
     installed,
     peer_clients,
     peer_connected,
@@ -228,6 +229,15 @@ def test_a_peer_answers_its_own_clients(client: PeerClient, obs: Path) -> None:
     assert robot
     assert simulation
     assert {(inference, rows) for _, _, inference, rows in (*robot, *simulation)} <= {(3.0, 1), (4.0, 2)}
+
+
+def test_a_peer_does_not_get_the_settings_of_our_running_server(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("RAY_SERVE_ENABLE_HA_PROXY", "1")
+    monkeypatch.setenv("VLAGENTS_RAY_HOST", "127.0.0.1")
+    monkeypatch.setenv("RAY_USAGE_STATS_ENABLED", "0")
+    changes = alone()
+    assert [changes.get(name, "kept") for name in ("RAY_SERVE_ENABLE_HA_PROXY", "VLAGENTS_RAY_HOST")] == [None, None]
+    assert "RAY_USAGE_STATS_ENABLED" not in changes
 
 
 def test_peers_are_named(tmp_path: Path) -> None:

@@ -97,3 +97,17 @@ def test_the_use_while_idle_is_not_that_of_an_act(monkeypatch: pytest.MonkeyPatc
     found = meter.per_act(10)
     assert found.pop("programs") == pytest.approx({"replica": 20, "haproxy": 0})
     assert found == pytest.approx({"cpu_ms": 20, "voluntary_switches": 3, "involuntary_switches": 0.1})
+
+
+def test_all_is_counted_of_a_process_that_polls(monkeypatch: pytest.MonkeyPatch) -> None:
+    moments = iter([0.0, 1.0, 1.0, 2.0])
+    monkeypatch.setattr(processes, "time", SimpleNamespace(monotonic=lambda: next(moments)))
+    counters = iter([(0.0, {}), (1.0, {}), (1.0, {}), (1.5, {})])  # its client holds half of its core in the turn
+    monkeypatch.setattr(processes, "_counters", lambda _: next(counters))
+    meter = UsageMeter([1])
+    with meter.counting():
+        pass
+    assert meter.mark_idle() == pytest.approx(1.0)
+    with meter.counting():
+        pass
+    assert meter.per_act(10)["cpu_ms"] == pytest.approx(50)

@@ -87,10 +87,12 @@ def browser(profile: Path) -> Iterator[Page]:
     try:
         line = next(line for line in process.stderr if "DevTools listening on" in line)
         address = line.rpartition(" ")[2].strip()
-        with connect(address, max_size=None, proxy=None) as socket:
+        # While it draws a large page, a browser answers no ping.
+        with connect(address, max_size=None, proxy=None, ping_interval=None) as socket:
             targets = _ask(socket, "Target.getTargets")["targetInfos"]
             page = next(one["targetId"] for one in targets if one["type"] == "page")
-        with connect(f"{address.partition('/devtools')[0]}/devtools/page/{page}", max_size=None, proxy=None) as socket:
+        target = f"{address.partition('/devtools')[0]}/devtools/page/{page}"
+        with connect(target, max_size=None, proxy=None, ping_interval=None) as socket:
             yield Page(socket)
     finally:
         process.terminate()

@@ -27,10 +27,18 @@ class ProcessFailed(VLAgentsError):
 
 
 class LineProcess:
-    """A process that answers lines with lines of JSON. Its standard error is shown if it fails."""
+    """A process that answers lines with lines of JSON. Its standard error is shown if it fails.
+
+    It has the environment variables of this process, changed by `environment`; None removes one.
+    """
 
     def __init__(
-        self, name: str, command: Sequence[str], environment: Mapping[str, str] | None = None, *, end_s: float = _END_S
+        self,
+        name: str,
+        command: Sequence[str],
+        environment: Mapping[str, str | None] | None = None,
+        *,
+        end_s: float = _END_S,
     ) -> None:
         self.name = name
         self._end_s = end_s  # time for the process to end after its input
@@ -41,7 +49,7 @@ class LineProcess:
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             stderr=self._errors,
-            env={**os.environ, **(environment or {})},
+            env={name: value for name, value in {**os.environ, **(environment or {})}.items() if value is not None},
             start_new_session=True,  # Ctrl-C goes to the bench, which ends its children in order
         )
         self._input, self._output = cast(IO[bytes], self._process.stdin), cast(IO[bytes], self._process.stdout)

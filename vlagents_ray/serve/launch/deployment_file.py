@@ -18,6 +18,7 @@ from vlagents_ray.ray_tools.runtime_env import require_no_secrets
 from vlagents_ray.registry import names, policy_class
 from vlagents_ray.serve.config.deployment import POLICY, ServerArgs
 from vlagents_ray.serve.models.checkpoints import CHOICE, STEP, Checkpoints
+from vlagents_ray.serve.ports import LOOPBACK
 from vlagents_ray.serve.python_env.probe import check_policy, with_process
 from vlagents_ray.serve.requests import DEFAULT
 from vlagents_ray.settings import wrong_settings
@@ -26,15 +27,14 @@ if TYPE_CHECKING:
     from ray.serve.schema import ServeDeploySchema
 
 IMPORT_PATH = "vlagents_ray.serve.app:build"
-DEFAULT_HOST, DEFAULT_PORT = "127.0.0.1", 8000
 _OUR_APP_KEYS = {"name", "route_prefix", "import_path", "args"}  # without those that Serve must apply
 
 
 class HttpSettings(BaseModel, extra="allow"):
     """Where the server listens; Serve's own default is all interfaces."""
 
-    host: str = DEFAULT_HOST
-    port: int = DEFAULT_PORT
+    host: str = LOOPBACK
+    port: int = 8000
 
 
 class Application(BaseModel, extra="allow"):
