@@ -176,7 +176,7 @@ def test_a_stopped_robot_does_not_go_to_rest() -> None:
     assert np.allclose(arm.path[-1], 0.004)
 
 
-def test_a_file_of_limits_is_read_without_a_yaml_package(tmp_path: Path) -> None:
+def test_a_file_of_limits_is_read_with_its_urdf(tmp_path: Path) -> None:
     (tmp_path / "arm.urdf").write_text(URDF)
     (tmp_path / "arm.yaml").write_text(
         "# of our arm\njoints: [pan, lift]\nvelocity: 2.5  # rad/s\nacceleration: [8, null]\n"
@@ -211,7 +211,8 @@ def test_the_tip_is_where_the_chain_of_transforms_puts_it(tmp_path: Path) -> Non
     ("text", "said"),
     [
         ("velocty: 3", "velocty"),
-        ("velocity:\n  - 1", "line 1"),
+        ("velocity: [1", "line 1"),
+        ("- 1", "TypeError"),
         ("velocity: fast", "fast"),
         ("unit: grad", "grad"),
         ("urdf: none.urdf", "none.urdf"),

@@ -44,13 +44,12 @@ class Limits:
     def read(cls, path: str | Path) -> Limits:
         """Read limits from a `.yaml` or `.json` file, a `.urdf` file, or the folder of a LeRobotDataset v3.0.
 
-        A YAML file has one `key: value` on a line, of which a value is a number, a text or a list in brackets; so
-        it is read without a package. Its keys are the fields of this class, without `chain`, and further `urdf`, a file
-        beside it whose limits also apply, and `tip`, the link that the workspace is for.
+        The keys of a YAML or JSON file are the fields of this class, without `chain`, and further `urdf`, a file beside
+        it whose limits also apply, and `tip`, the link that the workspace is for.
 
         Raises:
             ConfigError: The file is missing, or has an unknown key or a wrong value.
-            MissingDependency: A dataset needs the extra "record".
+            MissingDependency: YAML needs the extra "limits", a dataset "record".
         """
         path = Path(path)
         try:
@@ -58,8 +57,7 @@ class Limits:
                 return cls._of_dataset(path)
             if path.suffix == ".urdf":
                 return cls._of_urdf(path, (), None, 1.0)
-            text = path.read_text(encoding="utf-8")
-            given = json.loads(text) if path.suffix == ".json" else _flat_yaml(text)
+            given = _document(path)
             urdf, tip = given.pop("urdf", None), given.pop("tip", None)
             known = {one.name for one in fields(cls)} - {"chain"}
             if unknown := sorted(set(given) - known):
@@ -215,19 +213,12 @@ def _tuple(value: Any, unlimited: float) -> Any:
     return tuple(unlimited if one is None else one for one in value) if isinstance(value, list) else value
 
 
-def _flat_yaml(text: str) -> dict[str, Any]:
-    """Read lines of `key: value`; raises `ValueError` for anything else."""
-    found = {}
-    for number, line in enumerate(text.splitlines(), 1):
-        stated = line.partition(" #")[0].strip()
-        if not stated or stated.startswith("#"):
-            continue
-        key, colon, value = (part.strip() for part in stated.partition(":"))
-        if not (colon and value and line[0].strip()):
-            raise ValueError(f"line {number}: got {line.strip()!r}, want `key: value`, with a list in brackets")
-        try:
-            found[key] = json.loads(value)
-        except ValueError:
-            names = [one.strip(" \"'") for one in value.strip("[]").split(",")]
-            found[key] = names if value.startswith("[") else value.strip("\"'")
-    return found
+def _document(path: Path) -> Any:
+    text = path.read_text(encoding="utf-8")
+    if path.suffix == ".json":
+        return json.loads(text)
+    yaml = require("yaml", extra="limits")
+    try:
+        return yaml.safe_load(text)
+    except yaml.YAMLError as error:
+        raise ValueError(str(error)) from error
