@@ -9,8 +9,8 @@ import pytest
 from arm_models import ARMS, model_file, simulated_arm
 from faulty_arms import FAULTS, ClockStep, Fault, FaultyArm, QuaternionOrder
 
-from vlagents_ray.cli.robot_check import TerminalOperator, main
-from vlagents_ray.robot.check import CHECKS, RobotReport, examine
+from vlagents_ray.cli.robot_check import main
+from vlagents_ray.robot.check import CHECKS, Operator, RobotReport, examine
 from vlagents_ray.robot.mujoco_arm import MujocoArm, SimulatedOperator
 from vlagents_ray.testing import ContractViolation, check_robot
 
@@ -171,13 +171,13 @@ def test_the_command_checks_a_simulated_arm_without_a_person(
 def test_a_person_is_asked_before_each_motion(monkeypatch: pytest.MonkeyPatch) -> None:
     asked, answers = list[str](), iter(["y", "n", "", "y"])
     monkeypatch.setattr("builtins.input", lambda question: asked.append(question) or next(answers))
-    person = TerminalOperator(move=True)
+    person = Operator(move=True)
     assert person.agrees("a move of elbow by 0.05 rad and back")
     assert "a move of elbow by 0.05 rad and back. Is its space free?" in asked[0]
     assert person.saw_joint("elbow", -1) is False
     assert "calls -?" in asked[1]
     assert person.saw_closing() is None
-    assert not TerminalOperator(move=False).agrees("anything")
+    assert not Operator(move=False).agrees("anything")
     assert len(asked) == 3
 
 
@@ -186,4 +186,4 @@ def test_without_a_terminal_nothing_is_agreed(monkeypatch: pytest.MonkeyPatch) -
         raise EOFError
 
     monkeypatch.setattr("builtins.input", closed)
-    assert not TerminalOperator(move=True).agrees("a move")
+    assert not Operator(move=True).agrees("a move")

@@ -8,8 +8,8 @@ import pytest
 from arm_models import ARMS, model_file, simulated_arm
 
 from vlagents_ray.errors import ConfigError, InvalidAction
+from vlagents_ray.robot.loop import robot_named
 from vlagents_ray.robot.mujoco_arm import MujocoArm, SimulatedClock
-from vlagents_ray.robot.named import robot_named
 from vlagents_ray.validation import check_observation
 
 pytestmark = pytest.mark.sim

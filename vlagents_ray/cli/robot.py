@@ -11,13 +11,12 @@ from __future__ import annotations
 
 import argparse
 import contextlib
+import logging
 import signal
 import sys
 import threading
 from collections.abc import Callable, Iterator, Sequence
 from typing import Any, get_args
-
-import numpy as np
 
 from vlagents_ray.chunking.buffer import ENSEMBLE, MERGES, Mode
 from vlagents_ray.chunking.control import Leader
@@ -26,11 +25,10 @@ from vlagents_ray.client.agent import RemoteAgent
 from vlagents_ray.client.commands import CommandInbox
 from vlagents_ray.contract import Contract, require_match
 from vlagents_ray.errors import ConfigError, VLAgentsError
-from vlagents_ray.interface import Agent, Obs
+from vlagents_ray.interface import Agent
 from vlagents_ray.robot.fit import Trained, require_fit
 from vlagents_ray.robot.limits import Limits
-from vlagents_ray.robot.loop import LoopReport, Restart, Robot, import_class, run_loop
-from vlagents_ray.robot.named import robot_named
+from vlagents_ray.robot.loop import LoopReport, Restart, Robot, import_class, robot_named, run_loop
 from vlagents_ray.robot.record import Recorder
 from vlagents_ray.robot.ros import RosRobot, read_settings
 from vlagents_ray.robot.safety import SOFT_START_S, Guard, Watchdog, measured_state
@@ -38,6 +36,7 @@ from vlagents_ray.robot.simulated import SimulatedRobot
 from vlagents_ray.robot.teleoperation import HELP, AxesLeader, Keyboard, SpaceMouse, Terminal
 from vlagents_ray.viewers import open_viewer
 
+logger = logging.getLogger(__name__)
 MOSTLY_SAFE = 3  # exit status
 WAIT_S = 1.0  # deadline of a tick in the modes that wait for an answer; half of the default of --silent-s
 _DEVICES: dict[str, type[Keyboard | SpaceMouse]] = {"keyboard": Keyboard, "spacemouse": SpaceMouse}
@@ -135,16 +134,21 @@ def _run(options: argparse.Namespace) -> LoopReport:
             max_age_s=options.max_age_s,
             safe=options.safe,
         )
-        limits = None if options.limits is None else Limits.read(options.limits)
-        softly: dict[str, Any] = {} if limits is None else {"hz": hz, "soft_start_s": options.soft_start_s}
-        measure = measured_state(options.measure)
-        guard = Guard(contract, max_step=options.max_step, measure=measure, limits=limits, **softly)
+        guard = Guard(
+            contract,
+            max_step=options.max_step,
+            measure=measured_state(options.measure),
+            limits=None if options.limits is None else Limits.read(options.limits),
+            hz=hz,
+            soft_start_s=options.soft_start_s,
+        )
         player = stack.enter_context(ChunkPlayer(agent, settings, check=guard, override=leader))
         player.initialize()  # refuses unfit settings before anything is timed or moves
         robot: Robot = topics or (SimulatedRobot(contract) if make_robot is None else make_robot())
         stack.callback(getattr(robot, "close", lambda: None))
-        if options.trained_on is not None:
-            _require_fit(options, agent, robot.observe(), limits)
+        if topics is not None or make_robot is not None:
+            require_match(contract, getattr(robot, "contract", None))
+            _require_fit(options, agent, robot, guard.limits, say)
         recorder = None
         if options.record:
             recorder = stack.enter_context(Recorder(options.record, hz, interventions=leader is not None))
@@ -158,7 +162,6 @@ def _run(options: argparse.Namespace) -> LoopReport:
         silent_s = {"server": options.silent_s, "loop": hangs_s}
         watchdog = Watchdog(stop, silent_s if topics is None else {**topics.silent_s, **silent_s})
         if topics is not None:
-            require_match(contract, topics.contract)
             topics.watchdog = watchdog
         stack.enter_context(_restarting(watchdog, say))
         report = run_loop(
@@ -189,16 +192,22 @@ def _run(options: argparse.Namespace) -> LoopReport:
     return report
 
 
-def _require_fit(options: argparse.Namespace, agent: Agent, obs: Obs, limits: Limits | None) -> None:
-    """Compare the training of the checkpoint with the arm, before it moves."""
+def _require_fit(
+    options: argparse.Namespace, agent: Agent, robot: Robot, limits: Limits | None, say: Callable[[str], None]
+) -> None:
+    """Show the first chunk beside the training of the checkpoint and the limits of the arm, and compare them."""
+    stated = (getattr(agent, "metadata", {}).get("weights") or {}).get("statistics")
+    if options.trained_on is None and stated is None and limits is None:
+        return
+    trained = Trained.from_statistics(stated or {}) if options.trained_on is None else Trained.read(options.trained_on)
+    obs, contract, names = robot.observe(), agent.contract or Contract(), getattr(robot, "joint_names", ())
     agent.reset(obs, options.instruction)
-    contract = agent.contract
-    parts = [obs.state[name] for name in (contract and contract.state) or {} if name in obs.state]
-    if contract is not None and contract.gripper and obs.gripper is not None:
-        parts.append(np.array([obs.gripper]))
-    state = np.concatenate(parts) if parts else None
-    misfits = Trained.read(options.trained_on).misfits(state, agent.act(obs).rows(), limits)
-    require_fit(misfits, accept=options.accept_misfit)
+    chunk = agent.act(obs).rows()
+    for line in trained.drawn(chunk, limits, names):
+        say(line)
+        logger.info("%s", line)
+    state = trained.vector(obs, [*(contract.state or {}), *(["gripper"] if contract.gripper else [])])
+    require_fit(trained.misfits(state, chunk, limits, names), accept=options.accept_misfit)
 
 
 def _leader(
@@ -306,12 +315,10 @@ def command_parser() -> tuple[argparse.ArgumentParser, list[argparse.Action], li
     add("--hz", type=seconds, help=f"control rate (default: {_HZ:g}, or the environment's)")
     real("--seconds", type=seconds, default=60.0, help="how long (%(default)s)")
     real("--instruction", help="the task in words")
-    robots = "your robot's class, lerobot:TYPE or mujoco:ARM; default: a simulated one; see also `robot check --help`"
-    real("--robot", metavar="MODULE:CLASS", help=robots)
+    real("--robot", metavar="MODULE:CLASS", help="your class, lerobot:TYPE or mujoco:ARM; default: a simulated one")
     real("--robot-set", metavar="KEY=VALUE", action="append", default=[], help="an argument of the robot, repeatable")
     real("--ros", metavar="FILE", help="a robot behind topics of ROS 2, from this file; see docs/ros.md")
-    leaders = "device for taking over: keyboard, spacemouse, or, without --env, your MODULE:CLASS, see Leader"
-    add("--leader", metavar="LEADER", help=leaders)
+    add("--leader", metavar="LEADER", help="device for taking over: keyboard, spacemouse, or your MODULE:CLASS")
     add("--step", type=seconds, help="what a key or axis of these adds to a number of the action at a tick")
     add("--mode", choices=get_args(Mode), help="see PlayerSettings (default: async; with --env open_loop)")
     add("--execute", type=rows, metavar="N", help="rows of a chunk to execute before asking again")
@@ -326,15 +333,11 @@ def command_parser() -> tuple[argparse.ArgumentParser, list[argparse.Action], li
     real("--safe", choices=("auto", "hold", "zero"), default="auto", help=safe)
     add("--max-step", type=_number(), help="largest change of a number of the action from one tick to the next")
     real("--measure", metavar="PART", help="part of the state with the measured pose, for --max-step, e.g. joints")
-    limits = (
-        "limits of speed, acceleration and jerk: a .yaml file, a LeRobotDataset or a .urdf; see docs/control_loop.md"
-    )
-    real("--limits", metavar="PATH", help=limits)
+    limits = "limits of motion: a .yaml or .json file, a LeRobotDataset or a .urdf; see docs/control_loop.md"
+    add("--limits", metavar="PATH", help=limits)
     soft = "time of motion in which these rise from half of their values (%(default)s; 0: none)"
-    real("--soft-start-s", type=_number(), default=SOFT_START_S, help=soft)
-    trained = (
-        "refuse to move unless state, first chunk and --limits fit these statistics of the training: stats.json, …"
-    )
+    add("--soft-start-s", type=_number(), default=SOFT_START_S, help=soft)
+    trained = "file with statistics of the training, which arm and first chunk must fit (default: the server's, if any)"
     real("--trained-on", metavar="FILE", help=trained)
     real("--accept-misfit", action="store_true", help="move although they do not fit; the log shows it")
     restarts = "how motion restarts after a stop: by Enter, C or SIGUSR1, or by itself (manual; auto if simulated)"

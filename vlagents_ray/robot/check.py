@@ -8,7 +8,7 @@ import time
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 
@@ -49,23 +49,45 @@ _MOST_M = 5.0  # an arm with a longer reach gives millimetres
 _RED = 40  # of 255, by which red has to exceed green and blue where the card is
 
 
-class Operator(Protocol):
-    """The person at the robot. An answer None means that they cannot tell: the check is listed as not made."""
+class Operator:
+    """The person at the robot, who is asked at the terminal; a subclass answers otherwise.
+
+    An answer None means that they cannot tell: the check is listed as not made. Without `move` they agree to no motion.
+    """
+
+    def __init__(self, *, move: bool = True) -> None:
+        self._move = move
 
     def agrees(self, motion: str) -> bool:
         """Return whether the robot may make this motion now."""
+        return self._move and _asked(f"The robot will do this: {motion}. Is its space free?") is True
 
     def holds_card(self, camera: str | None) -> bool:
         """Hold something red in the upper left quarter of what a camera sees; None: take it away. False: no card."""
+        where = f"Hold something red in the upper left quarter of what camera {camera!r} sees"
+        return _asked(f"{'Take the card away' if camera is None else where}. Done?") is True
 
     def saw_joint(self, name: str, side: int) -> bool | None:
         """Return whether this joint alone has moved since `agrees`, towards its positive (1) or negative (-1) side."""
+        return _asked(f"Did {name} alone move, to the side that its manual calls {'+' if side > 0 else '-'}?")
 
     def saw_closing(self) -> bool | None:
         """Return whether the gripper is closed now."""
+        return _asked("Is the gripper closed?")
 
-    def sees_hand(self, position: np.ndarray, arm: int = 0) -> bool | None:
-        """Return whether an arm's hand is there: (3,) m from its base, x forwards, y to its left, z up."""
+    def sees_hand(self, pose: np.ndarray, arm: int = 0) -> bool | None:
+        """Return whether an arm's hand is at a pose, (7,): m from its base, x forwards, z up, and quaternion xyzw."""
+        x, y, z, *quaternion = np.round(pose, 2).tolist()
+        place = f"{x} m in front of the base, {y} m to its left, {z} m above it, with the quaternion xyzw {quaternion}"
+        return _asked(f"Is the hand of arm {arm + 1} there: {place}?")
+
+
+def _asked(question: str) -> bool | None:
+    try:
+        answer = input(f"{question} [y/n, Enter: cannot tell] ").strip().lower()
+    except EOFError:
+        return None
+    return {"y": True, "n": False}.get(answer[:1])
 
 
 @dataclass(frozen=True)
@@ -130,14 +152,12 @@ def examine(
 ) -> RobotReport:
     """Check a robot, first at rest, then by small moves of one joint at a time to which the operator agrees.
 
-    A finding at rest prevents all motion, one in motion stops the robot and ends the check. The robot may have the
-    attributes `contract`, `joint_names` (the joints in the order of an action, without grippers) and `joint_limits`
-    ((D, 2), in their units).
+    A finding at rest prevents all motion, one in motion stops the robot and ends the check.
 
     Args:
         robot: The robot, at rest and away from the limits of its joints.
-        contract: What the robot provides and accepts; by default its own `contract`. Moves need the action's `dim`,
-            and whether it is relative.
+        contract: What the robot provides and accepts; by default its own. Moves need `action.dim`, and whether actions
+            are relative.
         operator: The person at the robot; None: nothing moves.
         hz: The control rate, Hz; by default the contract's, else 50.
         latency_s: The longest time from a command to its measured motion, s.
@@ -150,20 +170,16 @@ def examine(
     suite = _Suite(robot, contract, operator, 1 / (hz or contract.control_hz or 50.0), latency_s, clock)
     try:
         suite.at_rest()
-        if suite.may_move():
-            suite.in_motion()
+        suite.in_motion()
     except _FoundInMotionError:
         pass
     except InvalidObservation as error:
         suite.find("observation", str(error), "an observation that fits the contract", "correct observe", ends=False)
     finally:
         robot.stop()
-    report = suite.report
-    found = {finding.check for finding in report.findings}
-    for name in CHECKS:
-        if name not in found and name not in report.passed:
-            report.skipped.setdefault(name, "an earlier check found something" if found else "nothing moved")
-    return report
+    found = {finding.check for finding in suite.report.findings}
+    suite.skip_others("an earlier check found something" if found else "nothing moved")
+    return suite.report
 
 
 class _FoundInMotionError(Exception):
@@ -199,7 +215,7 @@ class _Suite:
     def at_rest(self) -> None:
         """Run the checks that move nothing."""
         first = self._observe()
-        self._layout = _Layout.find(self._contract, first)
+        self._layout = _Layout.find(self._robot, self._contract, first)
         check_observation(first, self._contract)
         self._passes("observation")
         for _ in range(20):
@@ -218,30 +234,21 @@ class _Suite:
         self._check_cameras()
         self._check_place(last)
 
-    def may_move(self) -> bool:
-        """Return whether small moves can follow; if not, the report has the reason."""
-        reason = ""
-        action = self._contract.action
-        if self.report.findings:
-            return False
-        if self._operator is None:
-            reason = "no operator agreed to a motion"
-        elif action.relative is None or self._layout is None:
-            reason = "the contract states no joint targets or deltas (action.dim, space, delta) beside their state"
-        if reason:
-            self._skip_others(reason)
-        return not reason
-
     def in_motion(self) -> None:
-        """Move one joint at a time, then the grippers."""
-        layout, names = self._layout, self._names()
-        if layout is None or self._operator is None:
+        """Move one joint at a time, then the grippers, unless there is a finding or a reason against it."""
+        layout = self._layout
+        if self.report.findings:
+            return
+        if layout is None or self._contract.action.relative is None:
+            self.skip_others(
+                "the contract states no joint targets or deltas (action.dim, space, delta) and their state"
+            )
             return
         if not self._agreed("the command of the present pose, at which nothing should move"):
             return
         self._check_meaning(layout)
         self._passes("meaning", "blocking")
-        for joint, name in enumerate(names):
+        for joint, name in enumerate(layout.names):
             if not self._agreed(f"a move of {name} by {layout.step:g} {layout.unit} and back"):
                 return
             self._move(layout, joint, name)
@@ -252,27 +259,26 @@ class _Suite:
         self.report.figures["command to measured motion, ms"] = 1e3 * float(np.median(self._lags_s))
         self._check_grippers(layout)
 
+    def skip_others(self, reason: str) -> None:
+        """List the checks without a result as not made."""
+        done = {*self.report.passed, *(finding.check for finding in self.report.findings)}
+        for name in CHECKS:
+            if name not in done:
+                self.report.skipped.setdefault(name, reason)
+
     def _agreed(self, motion: str) -> bool:
         self._when = ""
-        if self._operator is not None and self._operator.agrees(motion):
+        if self._operator is None:
+            self.skip_others("no operator agreed to a motion")
+        elif self._operator.agrees(motion):
             self._when = motion
-            return True
-        self._skip_others(f"the operator did not agree to {motion}")
-        return False
-
-    def _skip_others(self, reason: str) -> None:
-        for name in CHECKS:
-            if name not in self.report.passed:
-                self.report.skipped.setdefault(name, reason)
+        else:
+            self.skip_others(f"the operator did not agree to {motion}")
+        return bool(self._when)
 
     def _passes(self, *checks: str) -> None:
         found = {finding.check for finding in self.report.findings} | self.report.skipped.keys()
         self.report.passed += [one for one in checks if one not in found and one not in self.report.passed]
-
-    def _names(self) -> list[str]:
-        count = len(self._layout.joints) if self._layout else 0
-        names = list(getattr(self._robot, "joint_names", []))
-        return names if len(names) == count else [f"joint {number}" for number in range(count)]
 
     def _observe(self) -> Obs:
         began_s = self._clock.monotonic()
@@ -319,13 +325,13 @@ class _Suite:
         self._passes("units")
 
     def _check_limits(self, obs: Obs) -> None:
-        layout, limits = self._layout, getattr(self._robot, "joint_limits", None)
+        layout = self._layout
         if any(finding.check == "units" for finding in self.report.findings):
             return
-        if layout is None or limits is None:
+        if layout is None or np.isinf(layout.limits).all():
             self.report.skipped["limits"] = "the robot has no `joint_limits`, or no state of its joints"
             return
-        for name, measured, (low, high) in zip(self._names(), layout.measured(obs), limits, strict=True):
+        for name, measured, (low, high) in zip(layout.names, layout.measured(obs), layout.limits, strict=True):
             if not low <= measured <= high:
                 got, want = f"{name} at {measured:.4g}", f"[{low:.4g}, {high:.4g}]"
                 self.find("limits", got, want, "give the limits of this arm, in the order and unit of its joints")
@@ -333,7 +339,11 @@ class _Suite:
         self._passes("limits")
 
     def _check_stop(self) -> None:
-        for place, call in (("", self._robot.stop), (" again", self._robot.stop), (" from a thread", self._in_thread)):
+        def in_thread() -> None:
+            with ThreadPoolExecutor(1) as thread:
+                thread.submit(self._robot.stop).result()
+
+        for place, call in (("", self._robot.stop), (" again", self._robot.stop), (" from a thread", in_thread)):
             began_s = self._clock.monotonic()
             try:
                 call()
@@ -341,30 +351,24 @@ class _Suite:
                 self.find("stop", f"{error!r} from stop{place}", "no error in any state", "make stop safe to repeat")
                 return
             if (took_s := self._clock.monotonic() - began_s) > _STOP_S:
-                cure = "send the stop and return"
-                self.find("stop", f"{took_s:.3g} s for stop{place}", f"at most {_STOP_S} s", cure)
+                self.find("stop", f"{took_s:.3g} s for stop{place}", f"at most {_STOP_S} s", "send it and return")
                 return
-
-    def _in_thread(self) -> None:
-        with ThreadPoolExecutor(1) as thread:
-            thread.submit(self._robot.stop).result()
 
     def _check_cameras(self) -> None:
         before = self._observe().cameras
         self.report.pictures |= before
-        if not before or self._operator is None:
-            self.report.skipped["cameras"] = "nobody could hold the red card" if before else "there is none"
-            return
         for camera in before:
-            if not self._operator.holds_card(camera):
+            if self._operator is None or not self._operator.holds_card(camera):
                 self.report.skipped["cameras"] = "nobody could hold the red card"
                 return
             self._clock.sleep(0.3)
             seen = self._observe().cameras
             self.report.pictures[f"{camera}, with the red card in the upper left"] = seen[camera]
-            found = {name: _card(before[name], seen[name]) for name in before}
-            self._judge_card(camera, found)
-        self._operator.holds_card(None)
+            self._judge_card(camera, {name: _card(before[name], seen[name]) for name in before})
+        if not before:
+            self.report.skipped["cameras"] = "there is none"
+        elif self._operator is not None:
+            self._operator.holds_card(None)
         self._passes("cameras")
 
     def _judge_card(self, camera: str, found: dict[str, _Card | None]) -> None:
@@ -383,7 +387,7 @@ class _Suite:
 
     def _check_place(self, obs: Obs) -> None:
         for number, arm in enumerate(self._contract.action.arms or ("",)):
-            pose = obs.state.get(_part(arm, "tquat"))
+            pose = obs.state.get(arm_part(arm, "tquat"))
             sees = None if pose is None or self._operator is None else self._operator.sees_hand(pose, number)
             if pose is None or sees is None:
                 self.report.skipped["place"] = "observations have no 'tquat', or the operator cannot tell"
@@ -413,7 +417,7 @@ class _Suite:
             moved = layout.measured(self._observe()) - start
             if np.abs(moved).max() > _RUNAWAY * layout.step:
                 most = int(np.argmax(np.abs(moved)))
-                got = f"a motion of {self._names()[most]} by {moved[most]:+.3g} and more"
+                got = f"a motion of {layout.names[most]} by {moved[most]:+.3g} and more"
                 kind = "absolute targets" if layout.relative else "deltas"
                 cure = f"the arm takes {kind}, or other units: correct apply, or action.delta of the contract"
                 self.find("meaning", got, "none at the command of the present pose", cure)
@@ -436,8 +440,7 @@ class _Suite:
     def _move(self, layout: _Layout, joint: int, name: str) -> None:
         before = self._observe()
         base, began_s = layout.measured(before), self._clock.monotonic()
-        limits = getattr(self._robot, "joint_limits", None)
-        room = limits is None or base[joint] + 2 * layout.step < limits[joint][1]
+        room = base[joint] + 2 * layout.step < layout.limits[joint][1]
         change = layout.step if room else -layout.step
         seen = self._ramp(layout, joint, change)
         after = self._observe()
@@ -449,12 +452,8 @@ class _Suite:
             self.report.skipped |= {"order": reason, "sign": reason}
         if saw is False:
             cure = "correct the order or the sign of the joints, in observe and in apply"
-            self.find(
-                "order",
-                f"another joint, or another side, when {name} was commanded",
-                f"{name} alone, {change:+g}",
-                cure,
-            )
+            got = f"another joint, or another side, when {name} was commanded"
+            self.find("order", got, f"{name} alone, {change:+g}", cure)
         half = [at for at, measured in seen if (measured[joint] - base[joint]) / change >= 0.5]
         self._lags_s.append((half[0] if half else np.inf) - began_s - _RAMP_S / 2)
         if self._lags_s[-1] > self._latency_s:
@@ -477,13 +476,12 @@ class _Suite:
 
     def _judge_move(self, layout: _Layout, joint: int, change: float, moved: np.ndarray) -> None:
         """Compare the measured changes of all joints, (D,), with the commanded change of one."""
-        names, most = self._names(), int(np.argmax(np.abs(moved)))
-        name, ratio = names[joint], float(moved[joint] / change)
+        most, name, ratio = int(np.argmax(np.abs(moved))), layout.names[joint], float(moved[joint] / change)
         if np.abs(moved).max() < 0.3 * layout.step:
             cure = "check that torque is on, and that apply sends each command"
             self.find("size", f"no motion of any joint for {name}", f"{change:+g}", cure)
         elif most != joint:
-            got = f"{names[most]} moved by {moved[most]:+.3g} when {name} was commanded"
+            got = f"{layout.names[most]} moved by {moved[most]:+.3g} when {name} was commanded"
             self.find("order", got, f"{name} alone", "give actions and state the same order of joints")
         elif ratio < 0:
             got = f"{name} moved by {moved[joint]:+.3g} for {change:+g}"
@@ -507,7 +505,7 @@ class _Suite:
         change = np.deg2rad(change) if layout.unit == "deg" else change
         along = abs(float((p1 - p0) @ turned[:3])) / max(1e-9, float(sine))
         if abs(angle - change) > 0.3 * change + 0.01:
-            got = f"the hand turned by {angle:.3g} rad for {change:.3g} rad of {self._names()[joint]}"
+            got = f"the hand turned by {angle:.3g} rad for {change:.3g} rad of {layout.names[joint]}"
             self.find("pose", got, "the same angle", "correct the rotation of the pose, or the unit of the joints")
         # The tolerance is for what other joints give way: 1 mm, and a sixth of the hand's way.
         if along > 0.001 + float(np.linalg.norm(p1 - p0)) / 6:
@@ -564,6 +562,8 @@ class _Layout:
     """The numbers of an action, and the parts of the state that measure them."""
 
     dim: int
+    names: list[str]  # of the joints
+    limits: np.ndarray  # (D, 2), of the joints; infinite if the robot has no `joint_limits`
     joints: list[int]  # their numbers in an action
     grippers: list[int]
     parts: list[str]  # of the state, which together have the joints
@@ -572,12 +572,12 @@ class _Layout:
     relative: bool
 
     @classmethod
-    def find(cls, contract: Contract, obs: Obs) -> _Layout | None:
+    def find(cls, robot: Robot, contract: Contract, obs: Obs) -> _Layout | None:
         """Return the layout; None if actions are not joints, each arm's gripper after them."""
         action: ActionSpec = contract.action
         if action.space not in (None, "joint") or action.dim is None:
             return None
-        parts = [key for arm in action.arms or ("",) if (key := _part(arm, "joints")) in obs.state]
+        parts = [key for arm in action.arms or ("",) if (key := arm_part(arm, "joints")) in obs.state]
         counts = [len(obs.state[part]) for part in parts]
         each = (action.dim - sum(counts)) // max(1, len(parts))
         if not parts or each not in (0, 1) or sum(counts) + each * len(parts) != action.dim:
@@ -591,8 +591,12 @@ class _Layout:
             grippers += range(at + count, at + count + each)
             pose = part.replace("joints", "tquat")
             poses += [pose if pose in obs.state else None] * count
+        names = list(getattr(robot, "joint_names", ()))
+        if len(names) != len(joints):
+            names = [f"joint {number}" for number in range(len(joints))]
+        limits = np.broadcast_to(getattr(robot, "joint_limits", (-np.inf, np.inf)), (len(joints), 2))
         unit = ((contract.state or {}).get(parts[0]) or StateSpec()).unit or "rad"
-        return cls(action.dim, joints, grippers, parts, poses, unit, bool(action.relative))
+        return cls(action.dim, names, limits, joints, grippers, parts, poses, unit, bool(action.relative))
 
     @property
     def step(self) -> float:
@@ -635,7 +639,7 @@ def _card(before: np.ndarray, after: np.ndarray) -> _Card | None:
     return _Card(larger is masks[0], columns.mean() / width, rows.mean() / height, len(rows) / larger.size)
 
 
-def _part(arm: str, name: str) -> str:
+def arm_part(arm: str, name: str) -> str:
     """Return the name of a part of the state for an arm; "" is the only one."""
     return f"{arm}/{name}" if arm else name
 

@@ -12,20 +12,27 @@ from typing import Any
 import numpy as np
 
 from vlagents_ray.errors import ConfigError, ContractMismatch
+from vlagents_ray.interface import Obs
 from vlagents_ray.robot.limits import Limits
 
 logger = logging.getLogger(__name__)
 _ROOM = 0.25  # share of the trained range by which a number may leave it: other tables and mounts differ a little
 # A robot in other units is outside by such factors: 180 / pi, 1000.
 _UNITS = {57.3: "degrees for radians", 1000.0: "millimetres for metres"}
+_WIDTH = 32  # characters of a drawn range
+_WANT = (
+    "LeRobot's meta/stats.json, openpi's norm_stats.json or GR00T's statistics.json, with min and max or q01 and q99"
+)
+Span = tuple[np.ndarray, np.ndarray]  # lowest and highest of D numbers, (D,) each
 
 
 @dataclass(frozen=True, slots=True)
 class Trained:
     """The ranges of the numbers on which a checkpoint was trained; None if they are not stated."""
 
-    state: tuple[np.ndarray, np.ndarray] | None  # lowest and highest, (D,) each
-    action: tuple[np.ndarray, np.ndarray] | None
+    state: Span | None = None
+    action: Span | None = None
+    parts: tuple[str, ...] | None = None  # of the state, in order; "gripper" is `Obs.gripper`
 
     @classmethod
     def read(cls, path: str | Path) -> Trained:
@@ -42,15 +49,27 @@ class Trained:
             found = found.get("norm_stats", found)
             if len(found) == 1 and {"state", "action"} <= set(next(iter(found.values()))):
                 [found] = found.values()
-            state, action = (
-                next((_range(found[key]) for key in keys if key in found), None)
-                for keys in (("observation.state", "state"), ("action", "actions"))
-            )
+            trained = cls.from_statistics(found)
         except (OSError, ValueError, TypeError, KeyError, AttributeError) as error:
             raise ConfigError(f"statistics {path}: {type(error).__name__}: {error}; want {_WANT}") from error
-        if state is None and action is None:
+        if trained.state is None and trained.action is None:
             raise ConfigError(f"statistics {path}: got {sorted(found)}, want {_WANT}")
-        return cls(state, action)
+        return trained
+
+    @classmethod
+    def from_statistics(cls, stated: Mapping[str, Any]) -> Trained:
+        """Return the ranges in statistics, such as those in a server's metadata (`Agent.statistics`)."""
+        state, action = (
+            next((_range(stated[key]) for key in keys if key in stated), None)
+            for keys in (("observation.state", "state"), ("action", "actions"))
+        )
+        return cls(state, action, tuple(stated["parts"]) if "parts" in stated else None)
+
+    def vector(self, obs: Obs, parts: Sequence[str]) -> np.ndarray | None:
+        """Return the state in the order of the training, else of `parts`, (D,); None if it has none of them."""
+        have = {**obs.state, **({} if obs.gripper is None else {"gripper": np.array([obs.gripper])})}
+        named = [have[part] for part in (parts if self.parts is None else self.parts) if part in have]
+        return np.concatenate(named) if named else None
 
     def misfits(
         self, state: np.ndarray | None, chunk: np.ndarray | None, limits: Limits | None, names: Sequence[str] = ()
@@ -61,10 +80,13 @@ class Trained:
             state: The arm's present state in the order of the training, (D,).
             chunk: The policy's first chunk, (H, D).
             limits: The limits of the arm.
-            names: The names of the numbers; default: those of `limits`.
+            names: The names of the numbers by the arm's driver; default: those of `limits`.
         """
-        names = names or (() if limits is None else limits.joints)
-        found = []
+        stated = [] if limits is None else [one.removesuffix(".pos") for one in limits.joints]
+        found, names = [], [one.removesuffix(".pos") for one in names] or stated
+        for i, (ours, theirs) in enumerate(zip(names, stated, strict=False)):
+            if ours != theirs and ours in stated:
+                found.append(f"joints: number {i} is {ours!r} of the arm and {theirs!r} of its limits; use one order")
         if self.state is not None and state is not None:
             found += _outside("state", state[np.newaxis], *self.state, names)
         if self.action is not None and chunk is not None:
@@ -81,10 +103,31 @@ class Trained:
                     )
         return found
 
-
-_WANT = (
-    "LeRobot's meta/stats.json, openpi's norm_stats.json or GR00T's statistics.json, with min and max or q01 and q99"
-)
+    def drawn(self, chunk: np.ndarray, limits: Limits | None, names: Sequence[str] = ()) -> list[str]:
+        """Draw the first chunk, (H, D), beside the training's actions and the limits: a line for each number."""
+        dim = chunk.shape[1]
+        bounds = limits or Limits()
+        ends = [(bounds.low, -np.inf), (bounds.high, np.inf)]
+        low, high = (one if one is not None and np.shape(one) in ((), (dim,)) else free for one, free in ends)
+        spans: list[Span] = [(np.broadcast_to(low, dim), np.broadcast_to(high, dim))]
+        unknown = np.full(dim, -np.inf), np.full(dim, np.inf)
+        spans.append(unknown if self.action is None or len(self.action[0]) != dim else self.action)
+        spans.append((chunk.min(0), chunk.max(0)))
+        lines = [
+            f"{'first chunk (#), training (-), limits (.)':<{_WIDTH + 22}}{'chunk':>20}{'training':>20}{'limits':>20}"
+        ]
+        for i in range(dim):
+            of_number = [(float(low[i]), float(high[i])) for low, high in spans]
+            finite = [end for span in of_number for end in span if np.isfinite(end)] or [0.0]
+            least, most = min(finite), max(finite)
+            row = np.full(_WIDTH, " ")
+            for mark, span in zip(".-#", of_number, strict=True):
+                if np.isfinite(span).any():
+                    places = (np.clip(span, least, most) - least) / max(most - least, 1e-9) * (_WIDTH - 1)
+                    row[int(places[0]) : int(places[1]) + 1] = mark
+            said = "".join(f"{f'{a:.3g} … {b:.3g}':>20}" for a, b in reversed(of_number))
+            lines.append(f"{_name(i, names):<20}|{''.join(row)}|{said}")
+        return lines
 
 
 def require_fit(misfits: Sequence[str], *, accept: bool = False) -> None:
@@ -97,7 +140,7 @@ def require_fit(misfits: Sequence[str], *, accept: bool = False) -> None:
     logger.warning("accepted although %s", text)
 
 
-def _range(stated: Mapping[str, Any]) -> tuple[np.ndarray, np.ndarray]:
+def _range(stated: Mapping[str, Any]) -> Span:
     if stated and all(isinstance(one, Mapping) for one in stated.values()):  # groups
         lows, highs = zip(*map(_range, stated.values()), strict=True)
         return np.concatenate(lows), np.concatenate(highs)

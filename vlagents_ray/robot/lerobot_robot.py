@@ -62,6 +62,22 @@ class LeRobotRobot:
         return [key.removesuffix(".pos") for key in self._keys]
 
     @property
+    def joint_limits(self) -> np.ndarray:
+        """The limits of the motors by LeRobot's settings and calibration, (D, 2) in their unit; infinite if unknown."""
+        return np.array([self._limits_of(name) for name in self.joint_names])
+
+    def _limits_of(self, name: str) -> tuple[float, float]:
+        if name in (stated := getattr(getattr(self._robot, "config", None), "joint_limits", None) or {}):
+            return stated[name]  # type: ignore[no-any-return]
+        bus = getattr(self._robot, "bus", None)
+        motor, ends = (getattr(bus, table, {}).get(name) for table in ("motors", "calibration"))
+        mode = getattr(getattr(motor, "norm_mode", None), "name", "")
+        if mode == "DEGREES" and ends is not None and hasattr(bus, "model_resolution_table"):
+            half = 180 * (ends.range_max - ends.range_min) / (bus.model_resolution_table[motor.model] - 1)
+            return -half, half
+        return {"RANGE_M100_100": (-100.0, 100.0), "RANGE_0_100": (0.0, 100.0)}.get(mode, (-np.inf, np.inf))
+
+    @property
     def contract(self) -> Contract:
         """The cameras, the joints and the actions, by LeRobot's features."""
         features = self._robot.observation_features

@@ -5,13 +5,15 @@ from __future__ import annotations
 import contextlib
 import gc
 import importlib
+import json
 import logging
 import math
 import os
 import time
 from collections import deque
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 from typing import Any, Literal, Protocol, get_args
 
 import numpy as np
@@ -31,6 +33,10 @@ logger = logging.getLogger(__name__)
 
 _COLLECT_S = 2.0
 ROBOT = ("observe", "apply", "stop")  # the methods of a `Robot`
+_ADAPTERS = {
+    "mujoco": "vlagents_ray.robot.mujoco_arm:MujocoArm",
+    "lerobot": "vlagents_ray.robot.lerobot_robot:LeRobotRobot",
+}
 
 
 class Robot(Protocol):
@@ -39,6 +45,10 @@ class Robot(Protocol):
     A simulated robot may have the attribute `simulated = True`: it starts again by itself after a stop (see `restart`
     of `run_loop`). A robot may have an attribute `holds`, the reason why it must not move now, such as a camera that
     hangs. While it is not None the robot is stopped; then the loop continues with a new observation.
+
+    `vlagents_ray.robot.check.examine` and `vlagents-ray robot` also use these attributes of a robot that has them:
+    `contract`, what it gives and takes; `joint_names`, the joints in the order of an action, without grippers; and
+    `joint_limits`, (D, 2) in their units. A method `close` is called at the end of the command.
     """
 
     def observe(self) -> Obs:
@@ -73,6 +83,25 @@ def import_class(option: str, name: str, methods: Sequence[str] = ()) -> Any:
     if missing := [method for method in methods if not callable(getattr(found, method, None))]:
         raise ConfigError(f"{option} {name}: lacks {', '.join(missing)}; want a class with {', '.join(methods)}")
     return found
+
+
+def robot_named(option: str, name: str, settings: Iterable[str] = ()) -> Callable[..., Robot]:
+    """Return what makes a robot: "module:Class", or an adapter and its argument, such as "lerobot:so101_follower".
+
+    The `settings` are further arguments as KEY=VALUE, of which the value is JSON or else text. Raises `ConfigError`.
+    """
+    given: dict[str, Any] = {}
+    for text in settings:
+        key, equals, value = text.partition("=")
+        if not equals:
+            raise ConfigError(f"{option}-set: got {text!r}, want KEY=VALUE, as in port=/dev/ttyACM0")
+        try:
+            given[key] = json.loads(value)
+        except json.JSONDecodeError:
+            given[key] = value
+    adapter, _, first = name.partition(":")
+    first_argument = (first,) if adapter in _ADAPTERS else ()
+    return partial(import_class(option, _ADAPTERS.get(adapter, name), ROBOT), *first_argument, **given)
 
 
 @dataclass(slots=True)

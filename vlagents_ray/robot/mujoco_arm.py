@@ -18,12 +18,13 @@ from vlagents_ray.errors import ConfigError, InvalidAction
 from vlagents_ray.interface import CAPTURED, Obs
 from vlagents_ray.naming import did_you_mean
 from vlagents_ray.registry import require
+from vlagents_ray.robot.check import Operator, arm_part
 
 _SETTLING_S = 1.0
 _GRIPPER = re.compile(r"gripper|finger|knuckle|jaw|fingers_actuator")
 _PREFIX = "vlagents_ray/"  # of what is added to a model, so that no name of the model is taken
 _KP, _KV = 1000.0, 100.0  # gains of a controller for a model without one, N m/rad and N m s/rad
-_CARD_M = 0.06  # distance from the camera at which the operator holds the card
+_RED = (220, 20, 30)  # the card of `SimulatedOperator`
 
 
 @dataclass(frozen=True)
@@ -82,10 +83,9 @@ class MujocoArm:
     """A simulated arm with a position controller, cameras, latency and measured joints.
 
     An action has the target of each joint, rad, and then the gripper's opening in [0, 1], 1 = open, for each arm in
-    turn; with `delta` the joints are relative to their last targets. An observation has the part `joints`, (D,) rad,
-    and `tquat`, (7,) the pose of the hand in the frame of the arm's base, m and quaternion xyzw; with two arms
-    `left/joints` and so on. `simulated` is True, so that a stop ends by itself. Physics advance with `clock` whenever
-    a method is called.
+    turn. An observation has the part `joints`, (D,) rad, and `tquat`, (7,) the pose of the hand in the frame of the
+    arm's base, m and quaternion xyzw; with two arms `left/joints` and so on. Physics advance with `clock` whenever a
+    method is called. `simulated` is True, so that a stop ends by itself.
 
     Args:
         model: A name of `ARMS` or of the MuJoCo Menagerie, or the path of an MJCF or URDF file. Names need the package
@@ -94,7 +94,7 @@ class MujocoArm:
         cameras: Names of the cameras. "front" looks at the arm; any other is on the hand of an arm in turn.
         size: Height and width of the pictures, px.
         fps: The rate of the cameras, Hz.
-        delta: Whether actions are relative.
+        delta: Whether actions are relative to the joints' last targets.
         latency_s: Time from `apply` until the controller has the command, s.
         speed: The largest speed at which the controller moves a joint's target, rad/s.
         clock: The module `time`, or a `SimulatedClock`.
@@ -130,6 +130,7 @@ class MujocoArm:
         self._goal = self._target = np.zeros(0)  # the commanded targets, and those on the way to them at `speed`
         self._renderer: Any = None
         self._pictures: dict[str, np.ndarray] = {}
+        self._card: str | None = None  # the camera before which the operator holds the red card
         self._pictures_s = -np.inf
         spec = _read(mujoco, stated, str(model))
         _add_actuators(mujoco, spec)
@@ -155,8 +156,8 @@ class MujocoArm:
         height, width = self._size
         state = {}
         for arm, drives in zip(self.arms, self._drives, strict=True):
-            state[_part(arm, "joints")] = StateSpec(sum(not drive.gripper for drive in drives), "rad")
-            state[_part(arm, "tquat")] = StateSpec(7, "m+quat_xyzw")
+            state[arm_part(arm, "joints")] = StateSpec(sum(not drive.gripper for drive in drives), "rad")
+            state[arm_part(arm, "tquat")] = StateSpec(7, "m+quat_xyzw")
         grips = any(drive.gripper for drive in self._flat)
         return Contract(
             cameras={name: CameraSpec(height, width) for name in self._cameras},
@@ -181,8 +182,8 @@ class MujocoArm:
         state, openings = {}, []
         for number, (arm, drives) in enumerate(zip(self.arms, self._drives, strict=True)):
             measured = [self._measured(drive) for drive in drives if not drive.gripper]
-            state[_part(arm, "joints")] = np.array(measured, np.float32)
-            state[_part(arm, "tquat")] = self.hand_pose(number)
+            state[arm_part(arm, "joints")] = np.array(measured, np.float32)
+            state[arm_part(arm, "tquat")] = self.hand_pose(number)
             openings += [self._measured(drive) for drive in drives if drive.gripper]
         opening = float(np.clip(np.mean(openings), 0, 1)) if openings else None
         images = {name: picture.copy() for name, picture in self._pictures.items()}
@@ -228,17 +229,8 @@ class MujocoArm:
         return np.array([*(turned.T @ (position - base)), *quaternion[1:], quaternion[0]], np.float32)
 
     def hold_card(self, camera: str | None) -> None:
-        """Hold a red card in the upper left of what a camera sees; None takes it away."""
-        at = np.array([0.0, 0.0, -10.0])
-        if camera is not None:
-            index = self._cameras[camera]
-            rotation = self.data.cam_xmat[index].reshape(3, 3)
-            half = np.tan(np.deg2rad(self.model.cam_fovy[index]) / 2)
-            aside = half * np.array([-self._size[1] / self._size[0], 1.0, 0.0]) / 2
-            at = self.data.cam_xpos[index] + _CARD_M * rotation @ (aside - [0, 0, 1])
-        self.data.mocap_pos[self.model.body(_PREFIX + "card").mocapid[0]] = at
-        self._mujoco.mj_kinematics(self.model, self.data)
-        self._pictures_s = -np.inf
+        """Show something red in the upper left of what a camera sees; None takes it away."""
+        self._card, self._pictures_s = camera, -np.inf
 
     def render(self) -> dict[str, np.ndarray]:
         """Return the present pictures of all cameras, (H, W, 3) uint8 RGB."""
@@ -248,7 +240,10 @@ class MujocoArm:
         pictures = {}
         for name, index in self._cameras.items():
             self._renderer.update_scene(self.data, index)
-            pictures[name] = self._renderer.render()
+            pictures[name] = picture = self._renderer.render()
+            if name == self._card:
+                height, width = np.array(picture.shape[:2]) // 8
+                picture[height : 3 * height, width : 3 * width] = _RED
         return pictures
 
     def _now(self) -> float:
@@ -294,24 +289,13 @@ class MujocoArm:
         self._rest(stated)
 
     def _add_scene(self, spec: Any, cameras: Sequence[str]) -> None:
-        """Add a floor, a light, the operator's card, and the cameras: "front" in the world, the others on the hands."""
-        mujoco = self._mujoco
-        spec.stat.extent, spec.visual.map.znear = 1.0, 0.01  # the card is shown from 1 cm on
-        spec.add_texture(
-            name=_PREFIX + "tiles", type=mujoco.mjtTexture.mjTEXTURE_2D, builtin=mujoco.mjtBuiltin.mjBUILTIN_CHECKER,
-            rgb1=[0.35, 0.35, 0.35], rgb2=[0.55, 0.55, 0.5], width=64, height=64,
-        )  # fmt: skip
-        tiles = spec.add_material(name=_PREFIX + "tiles", texrepeat=[5, 5], texuniform=True)
-        tiles.textures[mujoco.mjtTextureRole.mjTEXROLE_RGB] = _PREFIX + "tiles"
+        """Add a floor, a light and the cameras: "front" in the world, the others on the hands."""
+        spec.stat.extent, spec.visual.map.znear = 1.0, 0.01  # what is 1 cm from a camera is drawn
         world = spec.worldbody
         world.add_light(pos=[0, 0, 3], dir=[0.2, 0.1, -1])
-        shown = {"contype": 1 << 20, "conaffinity": 0}  # touches nothing; with 0, URDF files lose it as a visual
-        world.add_geom(
-            type=mujoco.mjtGeom.mjGEOM_PLANE, size=[3, 3, 0.1], pos=[0, 0, -0.01], material=tiles.name, **shown
-        )
-        card = world.add_body(name=_PREFIX + "card", mocap=True, pos=[0, 0, -10])
-        width = _CARD_M / 8
-        card.add_geom(type=mujoco.mjtGeom.mjGEOM_SPHERE, size=[width, 0, 0], rgba=[1, 0, 0, 1], **shown)
+        # The floor touches nothing; with 0, URDF files lose it as a visual.
+        floor = {"size": [3, 3, 0.1], "pos": [0, 0, -0.01], "contype": 1 << 20, "conaffinity": 0}
+        world.add_geom(type=self._mujoco.mjtGeom.mjGEOM_PLANE, rgba=[0.45, 0.45, 0.42, 1], **floor)
         hands = [self._pose(hand) for hand in self._hands]
         centre = np.mean([position for position, _ in hands] + [self.data.xpos[base] for base in self._bases], axis=0)
         reach = max(np.linalg.norm(p - self.data.xpos[b]) for (p, _), b in zip(hands, self._bases, strict=True))
@@ -391,10 +375,6 @@ class MujocoArm:
         return self.data.xpos[body], self.data.xmat[body].reshape(3, 3)
 
 
-def _part(arm: str, name: str) -> str:
-    return f"{arm}/{name}" if arm else name
-
-
 def _read(mujoco: Any, stated: ArmModel, model: str) -> Any:
     """Return the specification of a model file, which MuJoCo can compile."""
     file = Path(model)
@@ -445,7 +425,7 @@ def _add_actuators(mujoco: Any, spec: Any) -> None:
         )
 
 
-class SimulatedOperator:
+class SimulatedOperator(Operator):
     """A person at a simulated arm, who agrees to every motion and sees what the arm does."""
 
     def __init__(self, arm: MujocoArm) -> None:
@@ -453,23 +433,19 @@ class SimulatedOperator:
         self._before = arm.joints()
 
     def agrees(self, motion: str) -> bool:
-        """Agree, and look where the joints are."""
         self._before = self._arm.joints()
         return True
 
     def holds_card(self, camera: str | None) -> bool:
-        """Hold the red card, or take it away."""
         self._arm.hold_card(camera)
         return True
 
     def saw_joint(self, name: str, side: int) -> bool | None:
-        """Return whether that joint has moved most since the person agreed, towards a side, 1 or -1."""
         moved = self._arm.joints() - self._before
         most = int(np.argmax(np.abs(moved)))
         return self._arm.joint_names[most] == name and bool(moved[most] * side > 0)
 
     def saw_closing(self) -> bool | None:
-        """Return whether the gripper is nearly closed."""
         return self._arm.opening() < 0.5
 
     def sees_hand(self, pose: np.ndarray, arm: int = 0) -> bool | None:

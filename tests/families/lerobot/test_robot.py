@@ -9,7 +9,7 @@ from vlagents_ray.errors import ConfigError, InvalidAction
 from vlagents_ray.robot import lerobot_robot
 from vlagents_ray.robot.check import examine
 from vlagents_ray.robot.mujoco_arm import SimulatedClock
-from vlagents_ray.robot.named import robot_named
+from vlagents_ray.robot.loop import robot_named
 
 SPEED = 90.0  # deg/s of the motors
 CLOCK = SimulatedClock()
