@@ -8,6 +8,9 @@ command:
 - no command after a stop or a pause until the operator at the robot has restarted it.
 
 Exit status: 0 without a violation, else 1. `--hours` and the seed repeat a violation, whose time the report has.
+
+`--ticks 20000` measures in place of a day what a tick costs: of the guard, and from `observe` until `apply` with and
+without it.
 """
 
 from __future__ import annotations
@@ -15,9 +18,12 @@ from __future__ import annotations
 import contextlib
 import hashlib
 import math
+import tempfile
+import time
 from collections import Counter
 from collections.abc import Iterator
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
+from pathlib import Path
 from typing import Annotated
 from unittest import mock
 
@@ -33,6 +39,7 @@ from vlagents_ray.contract import ActionSpec, Contract
 from vlagents_ray.errors import ConnectionLost, DeadlineExceeded, PolicyFailed, PolicyUnavailable, VLAgentsError
 from vlagents_ray.interface import CAPTURED, Act, Agent, Obs
 from vlagents_ray.robot import Guard, Limits, Watchdog, loop, run_loop, safety
+from vlagents_ray.robot.simulated import SimulatedRobot
 
 HZ = 50.0
 RUN_S = 3600.0  # a run of the control loop; the arm goes to its rest pose between two
@@ -406,12 +413,87 @@ def play_day(seed: int, hours: float, *, faults: bool = True, normal_step: float
     return world.finished()
 
 
+class CirclePolicy(Agent):
+    """Moves all joints to and fro, from rest."""
+
+    contract: Contract | None = None  # type: ignore[assignment]
+
+    def __init__(self, joints: int) -> None:
+        self.contract = Contract(action=ActionSpec(dim=joints, delta=False), chunk=CHUNK)
+        self._joints, self._asked = joints, 0
+
+    def act(self, obs: Obs) -> Act:
+        rows = [self.row(self._asked * CHUNK + i) for i in range(CHUNK)]
+        self._asked += 1
+        return Act(np.stack(rows))
+
+    def row(self, tick: int) -> np.ndarray:
+        """Return the action of a tick, (D,) float32 rad."""
+        return np.full(self._joints, _RADIUS * (1 - math.cos(_TURN * tick)), np.float32)
+
+
+def limits_of(joints: int) -> Limits:
+    """Return limits of speed, acceleration, jerk and the workspace of an arm's tip behind its first seven joints."""
+    links = "".join(
+        f'<joint name="{i}" type="revolute"><parent link="{i}"/><child link="{i + 1}"/><origin xyz="0 0 0.15" '
+        f'rpy="{(-1) ** i * 1.57} 0 0"/><axis xyz="0 0 1"/><limit lower="-3" upper="3" velocity="2"/></joint>'
+        for i in range(joints)
+    )
+    with tempfile.TemporaryDirectory() as folder:
+        Path(folder, "arm.urdf").write_text(f"<robot name='arm'>{links}</robot>")
+        Path(folder, "arm.json").write_text('{"urdf": "arm.urdf", "tip": "7"}')
+        read = Limits.read(Path(folder, "arm.json"))
+    cube = {"workspace_low": (-2.0, -2.0, -2.0), "workspace_high": (2.0, 2.0, 2.0)}
+    return replace(read, acceleration=LIMITS.acceleration, jerk=LIMITS.jerk, **cube)
+
+
+def tick_us(joints: int, ticks: int, *, part: str) -> list[float]:
+    """Measure part of each tick, µs: "guard", or from `observe` until `apply`, "loop" or "loop without guard"."""
+    policy, took = CirclePolicy(joints), list[float]()
+    guard = None if part == "loop without guard" else Guard(policy.contract, limits=limits_of(joints), hz=HZ)
+    if part == "guard" and guard is not None:
+        last = guard(policy.row(0))
+        for tick in range(1, ticks):
+            action = policy.row(tick)
+            begun = time.perf_counter()
+            last = guard(action, last)
+            took.append(1e6 * (time.perf_counter() - begun))
+        return took
+    robot = SimulatedRobot(policy.contract)
+    with ChunkPlayer(policy, PlayerSettings(mode="open_loop", deadline_s=1.0), check=guard) as driver:
+        driver.initialize()
+        driver.reset(robot.observe())
+        for _ in range(ticks):
+            begun = time.perf_counter()
+            robot.apply(driver.act(robot.observe()).action)
+            took.append(1e6 * (time.perf_counter() - begun))
+    return took
+
+
+def measure_ticks(ticks: int) -> dict[str, dict[str, float]]:
+    """Return median and 99 % quantile of each part of a tick, µs."""
+    found = {}
+    for joints in (7, 14):
+        for part in ("guard", "loop", "loop without guard"):
+            tick_us(joints, ticks // 10, part=part)  # warm
+            p50, p99 = np.quantile(tick_us(joints, ticks, part=part), [0.5, 0.99])
+            found[f"{part}, {joints} joints"] = {"p50_us": round(float(p50), 1), "p99_us": round(float(p99), 1)}
+    return found
+
+
 def main(
     seed: int = 0,
     hours: Annotated[float, typer.Option(help="of simulated time")] = 24.0,
+    ticks: Annotated[int, typer.Option(help="measure the cost of so many ticks, and play no day")] = 0,
     json: Json = None,
 ) -> None:
     """Play a day with faults, and compare its steps with those of ten minutes without."""
+    if ticks:
+        measured = measure_ticks(ticks)
+        save({"ticks": measured}, json)
+        for name, figures in measured.items():
+            out.print(f"{name}: {figures}")
+        return
     with errors():
         normal = play_day(seed, 1 / 6, faults=False).largest_step
         report = play_day(seed, hours, normal_step=normal)

@@ -2,14 +2,15 @@
 
 import numpy as np
 import pytest
+from lerobot.motors import MotorCalibration
 from lerobot.robots.so_follower import so_follower
 from lerobot_robot_mirror import MOTORS
 
 from vlagents_ray.errors import ConfigError, InvalidAction
 from vlagents_ray.robot import lerobot_robot
 from vlagents_ray.robot.check import examine
-from vlagents_ray.robot.mujoco_arm import SimulatedClock
 from vlagents_ray.robot.loop import robot_named
+from vlagents_ray.robot.mujoco_arm import SimulatedClock
 
 SPEED = 90.0  # deg/s of the motors
 CLOCK = SimulatedClock()
@@ -21,6 +22,8 @@ class Bus:
     def __init__(self, port: str, motors: dict[str, object], calibration: object) -> None:
         self.positions = dict.fromkeys(motors, 10.0)
         self.motors, self.goals, self.at_s = motors, dict(self.positions), CLOCK.monotonic()
+        self.calibration = {name: MotorCalibration(i, 0, 0, 1024, 3071) for i, name in enumerate(motors)}
+        self.model_resolution_table = {"sts3215": 4096}
         self.is_connected, self.is_calibrated = False, port != "/dev/new"
 
     def connect(self) -> None:
@@ -72,6 +75,8 @@ def test_an_so101_is_driven_by_name_in_lerobots_order_and_units() -> None:
     arm = robot_named("--robot", "lerobot:so101_follower", ["port=/dev/ttyACM0", "id=mine"])()
     assert arm.joint_names == ["shoulder_pan", "shoulder_lift", "elbow_flex", "wrist_flex", "wrist_roll", "gripper"]
     assert arm.contract.state["joints"].unit == "deg"
+    half = 360 * 2047 / 4095 / 2  # of the calibrated range
+    np.testing.assert_allclose(arm.joint_limits, [*[(-half, half)] * 5, (0, 100)])
     arm.apply(np.arange(6, dtype=np.float32))
     CLOCK.sleep(1.0)
     assert arm.observe().state["joints"].tolist() == [0, 1, 2, 3, 4, 5]
@@ -79,7 +84,9 @@ def test_an_so101_is_driven_by_name_in_lerobots_order_and_units() -> None:
         arm.apply(np.zeros(7, np.float32))
     report = examine(arm, operator=Person(), clock=CLOCK)
     assert report.ok, report.lines()
-    assert {"meaning", "order", "sign", "size", "latency", "rate", "commands", "stop", "clock"} <= set(report.passed)
+    assert {"limits", "meaning", "order", "sign", "size", "latency", "rate", "commands", "stop", "clock"} <= set(
+        report.passed
+    )
     arm.close()
     assert not arm._robot.is_connected
 
