@@ -138,7 +138,7 @@ def _run(options: argparse.Namespace) -> LoopReport:
             contract,
             max_step=options.max_step,
             measure=measured_state(options.measure),
-            limits=None if options.limits is None else Limits.read(options.limits),
+            limits=options.limits,
             hz=hz,
             soft_start_s=options.soft_start_s,
         )

@@ -1,7 +1,7 @@
 """Check a robot before a policy moves it: readings, pictures and `stop` at rest, then small moves, joint by joint.
 
-Nothing moves without --move, and then each motion only after a person at the robot has agreed. A simulated robot of
-"mujoco:ARM" is checked without a person.
+Nothing moves without --move, and then each motion only after a person at the robot has agreed. A simulated arm,
+"mujoco:ARM", is checked without a person.
 
 Exit status: 0 if no check found anything, 1 if one did, 2 if it could not run.
 """
@@ -11,14 +11,14 @@ from __future__ import annotations
 import argparse
 import contextlib
 import sys
+import time
 from collections.abc import Sequence
-from typing import Any
 
 from vlagents_ray.client.agent import RemoteAgent
 from vlagents_ray.errors import VLAgentsError
 from vlagents_ray.robot.check import Operator, RobotReport, examine
-from vlagents_ray.robot.loop import robot_named
-from vlagents_ray.robot.mujoco_arm import SimulatedClock, SimulatedOperator
+from vlagents_ray.robot.loop import Robot, robot_named
+from vlagents_ray.robot.mujoco_arm import SimulatedClock
 from vlagents_ray.robot.ros import RosRobot, read_settings
 
 
@@ -42,22 +42,25 @@ def main(arguments: Sequence[str]) -> int:
 
 
 def _checked(options: argparse.Namespace, stack: contextlib.ExitStack) -> RobotReport:
-    robot: Any
-    given: dict[str, Any] = {"operator": Operator(move=options.move)}
+    robot: Robot
     if options.ros is not None:
         robot = stack.enter_context(RosRobot(read_settings(options.ros)))
     else:
         make = robot_named("robot", options.robot, options.robot_set)
-        if options.robot.startswith("mujoco:"):
-            robot = make(clock=SimulatedClock())
-            given = {"operator": SimulatedOperator(robot), "clock": robot.clock}
-        else:
-            robot = make()
+        robot = make(clock=SimulatedClock()) if options.robot.startswith("mujoco:") else make()
         stack.callback(getattr(robot, "close", lambda: None))
+    contract = None
     if options.policy is not None:
         with RemoteAgent(options.policy) as agent:
-            given["contract"] = agent.contract
-    return examine(robot, hz=options.hz, latency_s=options.latency_ms / 1e3, **given)
+            contract = agent.contract
+    return examine(
+        robot,
+        contract=contract,
+        operator=getattr(robot, "operator", None) or Operator(move=options.move),
+        hz=options.hz,
+        latency_s=options.latency_ms / 1e3,
+        clock=getattr(robot, "clock", time),
+    )
 
 
 def command_parser() -> argparse.ArgumentParser:

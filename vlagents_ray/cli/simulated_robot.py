@@ -19,7 +19,7 @@ from vlagents_ray.envs.base import EvalEnv, make_env
 from vlagents_ray.errors import ConfigError
 from vlagents_ray.interface import Agent, Obs
 from vlagents_ray.policies.wrapper import Wrapper, build_agent
-from vlagents_ray.robot import Guard, Limits, run_loop
+from vlagents_ray.robot import Guard, run_loop
 from vlagents_ray.robot.episode import Label
 from vlagents_ray.robot.record import Recorder
 from vlagents_ray.robot.simulated import EnvRobot
@@ -106,7 +106,7 @@ class RobotRun:
             guard = Guard(
                 env.contract,
                 max_step=self.options.max_step,
-                limits=None if self.options.limits is None else Limits.read(self.options.limits),
+                limits=self.options.limits,
                 hz=hz,
                 soft_start_s=self.options.soft_start_s,
             )

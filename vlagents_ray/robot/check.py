@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from vlagents_ray.contract import ActionSpec, Contract, StateSpec
-from vlagents_ray.errors import InvalidObservation
+from vlagents_ray.errors import ConfigError, InvalidObservation
 from vlagents_ray.images.jpeg_png import encode_jpeg
 from vlagents_ray.interface import CAPTURED, Obs
 from vlagents_ray.robot.loop import Robot
@@ -240,9 +240,7 @@ class _Suite:
         if self.report.findings:
             return
         if layout is None or self._contract.action.relative is None:
-            self.skip_others(
-                "the contract states no joint targets or deltas (action.dim, space, delta) and their state"
-            )
+            self.skip_others("the contract states no joint targets or deltas (action.dim, space, delta), or no state")
             return
         if not self._agreed("the command of the present pose, at which nothing should move"):
             return
@@ -594,7 +592,9 @@ class _Layout:
         names = list(getattr(robot, "joint_names", ()))
         if len(names) != len(joints):
             names = [f"joint {number}" for number in range(len(joints))]
-        limits = np.broadcast_to(getattr(robot, "joint_limits", (-np.inf, np.inf)), (len(joints), 2))
+        limits = np.asarray(getattr(robot, "joint_limits", [(-np.inf, np.inf)] * len(joints)))
+        if limits.shape != (len(joints), 2):
+            raise ConfigError(f"joint_limits: got {limits.shape}, want ({len(joints)}, 2), a low and a high for each")
         unit = ((contract.state or {}).get(parts[0]) or StateSpec()).unit or "rad"
         return cls(action.dim, names, limits, joints, grippers, parts, poses, unit, bool(action.relative))
 

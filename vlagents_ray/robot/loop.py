@@ -46,9 +46,10 @@ class Robot(Protocol):
     of `run_loop`). A robot may have an attribute `holds`, the reason why it must not move now, such as a camera that
     hangs. While it is not None the robot is stopped; then the loop continues with a new observation.
 
-    `vlagents_ray.robot.check.examine` and `vlagents-ray robot` also use these attributes of a robot that has them:
-    `contract`, what it gives and takes; `joint_names`, the joints in the order of an action, without grippers; and
-    `joint_limits`, (D, 2) in their units. A method `close` is called at the end of the command.
+    `vlagents-ray robot`, its `check` and `vlagents_ray.robot.check.examine` use further attributes of a robot that has
+    them: `contract`, what it gives and takes; `joint_names`, its joints in the order of an action, without grippers;
+    `joint_limits`, (D, 2) in their units; of a simulated one `operator`, a `vlagents_ray.robot.check.Operator` in place
+    of the person at the robot, and `clock`, the module `time` of its simulation; and `close`, called at the end.
     """
 
     def observe(self) -> Obs:

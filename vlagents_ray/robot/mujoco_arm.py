@@ -141,6 +141,11 @@ class MujocoArm:
         self._begun_s = clock.monotonic() - self.data.time
 
     @property
+    def operator(self) -> SimulatedOperator:
+        """A person who sees the arm, for its check."""
+        return SimulatedOperator(self)
+
+    @property
     def joint_names(self) -> list[str]:
         """The names of the joints without grippers, in the order of an action."""
         return [drive.name for drive in self._flat if not drive.gripper]

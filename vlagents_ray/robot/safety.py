@@ -7,6 +7,7 @@ import math
 import threading
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from pathlib import Path
 
 import numpy as np
 
@@ -43,7 +44,7 @@ class Guard:
         max_step: Largest difference between two consecutive actions, for all numbers or (D,); None checks none.
         measure: Returns the measured pose in an observation, (D,) in the action's order and units, e.g.
             `lambda obs: obs.state["joints"]`; not for relative actions.
-        limits: The limits of the robot's motion.
+        limits: The limits of the robot's motion, or the path that `Limits.read` reads.
         hz: The control rate, Hz; needed with `limits`.
         soft_start_s: The time of motion, s, within which the limits of speed, acceleration and jerk rise from half to
             their values, since most accidents happen in the first minutes of a new checkpoint; 0 for none.
@@ -61,12 +62,12 @@ class Guard:
         high: float | np.ndarray | None = None,
         max_step: float | np.ndarray | None = None,
         measure: Callable[[Obs], np.ndarray] | None = None,
-        limits: Limits | None = None,
+        limits: Limits | str | Path | None = None,
         hz: float | None = None,
         soft_start_s: float = SOFT_START_S,
     ) -> None:
         spec = contract.action if contract is not None else ActionSpec()
-        self.limits = limits
+        self.limits = limits = Limits.read(limits) if isinstance(limits, (str, Path)) else limits
         self.hz = hz
         self._dim = spec.dim
         self._relative = bool(spec.relative)

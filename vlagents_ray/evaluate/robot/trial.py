@@ -24,7 +24,7 @@ from vlagents_ray.evaluate.robot.operator import Operator
 from vlagents_ray.evaluate.workers.rollout import AgentFactory
 from vlagents_ray.interface import Act, Agent, Obs
 from vlagents_ray.naming import plain
-from vlagents_ray.robot import Guard, Limits, LoopReport, Robot, Watchdog, run_loop
+from vlagents_ray.robot import Guard, LoopReport, Robot, Watchdog, run_loop
 from vlagents_ray.robot.record import Recorder
 from vlagents_ray.robot.safety import measured_state
 
@@ -249,7 +249,7 @@ def _player(
                 agent.contract,
                 max_step=settings.max_step,
                 measure=measured_state(settings.measure),
-                limits=None if settings.limits is None else Limits.read(settings.limits),
+                limits=settings.limits,
                 hz=settings.hz,
                 soft_start_s=0.0,  # the same limits in each trial of each policy
             ),
