@@ -84,7 +84,8 @@ class MujocoArm:
 
     An action has the target of each joint, rad, and then the gripper's opening in [0, 1], 1 = open, for each arm in
     turn. An observation has the part `joints`, (D,) rad, and `tquat`, (7,) the pose of the hand in the frame of the
-    arm's base, m and quaternion xyzw; with two arms `left/joints` and so on. Physics advance with `clock` whenever a
+    arm's base, m and quaternion xyzw; with two arms `left/joints` and so on. `contract`, `joint_names`, `joint_limits`
+    and `operator` describe the arm to the loop and to the check of a robot. Physics advance with `clock` whenever a
     method is called. `simulated` is True, so that a stop ends by itself.
 
     Args:
@@ -139,39 +140,23 @@ class MujocoArm:
         self._compile(spec, stated)
         self._cameras = {name: self.model.camera(_PREFIX + name).id for name in cameras}
         self._begun_s = clock.monotonic() - self.data.time
-
-    @property
-    def operator(self) -> SimulatedOperator:
-        """A person who sees the arm, for its check."""
-        return SimulatedOperator(self)
-
-    @property
-    def joint_names(self) -> list[str]:
-        """The names of the joints without grippers, in the order of an action."""
-        return [drive.name for drive in self._flat if not drive.gripper]
-
-    @property
-    def joint_limits(self) -> np.ndarray:
-        """The limits of the joints of `joint_names`, (D, 2) rad."""
-        return np.array([(drive.low[0], drive.high[0]) for drive in self._flat if not drive.gripper])
-
-    @property
-    def contract(self) -> Contract:
-        """The cameras, the state and the actions of this arm."""
-        height, width = self._size
+        joints = [drive for drive in self._flat if not drive.gripper]
+        self.joint_names = [drive.name for drive in joints]
+        self.joint_limits = np.array([(drive.low[0], drive.high[0]) for drive in joints])
+        self.operator = SimulatedOperator(self)
         state = {}
         for arm, drives in zip(self.arms, self._drives, strict=True):
             state[arm_part(arm, "joints")] = StateSpec(sum(not drive.gripper for drive in drives), "rad")
             state[arm_part(arm, "tquat")] = StateSpec(7, "m+quat_xyzw")
-        grips = any(drive.gripper for drive in self._flat)
-        return Contract(
-            cameras={name: CameraSpec(height, width) for name in self._cameras},
+        grips = len(joints) < len(self._flat)
+        self.contract = Contract(
+            cameras={name: CameraSpec(*size) for name in cameras},
             state=state,
             gripper=grips,
             action=ActionSpec(
                 dim=len(self._flat),
                 space="joint",
-                delta=self.delta,
+                delta=delta,
                 gripper_open=1.0 if grips else None,
                 gripper_closed=0.0 if grips else None,
                 arms=self.arms if self.arms != ("",) else None,
@@ -417,17 +402,11 @@ def _add_actuators(mujoco: Any, spec: Any) -> None:
         body.gravcomp = 1
     for joint in spec.joints:
         joint.armature = 0.1
-        ends = joint.range if joint.range[0] < joint.range[1] else [-np.pi, np.pi]
         spec.add_actuator(
-            name=joint.name,
-            target=joint.name,
-            trntype=mujoco.mjtTrn.mjTRN_JOINT,
-            biastype=mujoco.mjtBias.mjBIAS_AFFINE,
-            gainprm=[_KP, *[0] * 9],
-            biasprm=[0, -_KP, -_KV, *[0] * 7],
-            ctrlrange=ends,
-            ctrllimited=True,
-        )
+            name=joint.name, target=joint.name, trntype=mujoco.mjtTrn.mjTRN_JOINT,
+            biastype=mujoco.mjtBias.mjBIAS_AFFINE, gainprm=[_KP, *[0] * 9], biasprm=[0, -_KP, -_KV, *[0] * 7],
+            ctrlrange=joint.range if joint.range[0] < joint.range[1] else [-np.pi, np.pi], ctrllimited=True,
+        )  # fmt: skip
 
 
 class SimulatedOperator(Operator):
