@@ -10,6 +10,7 @@ from arm_models import ARMS, model_file, simulated_arm
 from faulty_arms import FAULTS, ClockStep, Fault, FaultyArm, QuaternionOrder
 
 from vlagents_ray.cli.robot_check import main
+from vlagents_ray.errors import ConfigError
 from vlagents_ray.robot.check import CHECKS, Operator, RobotReport, examine
 from vlagents_ray.robot.mujoco_arm import MujocoArm, SimulatedOperator
 from vlagents_ray.testing import ContractViolation, check_robot
@@ -148,6 +149,14 @@ def test_the_report_has_pictures_and_no_links(tmp_path: Path) -> None:
     page = (tmp_path / "report.html").read_text()
     assert page.count("<img") == len(report.pictures) == 4
     assert "http" not in page
+
+
+def test_limits_of_another_number_of_joints_are_an_error() -> None:
+    with closing(simulated_arm("franka", cameras=())) as arm:
+        robot = FaultyArm(arm)
+        robot.joint_limits = np.zeros((6, 2))
+        with pytest.raises(ConfigError, match=r"joint_limits: got \(6, 2\), want \(7, 2\)"):
+            checked(arm, robot)
 
 
 def test_check_robot_raises_every_finding() -> None:

@@ -155,21 +155,14 @@ class Chain:
         self._to_rad = to_rad
         while tip in parents:
             name, one = parents[tip]
-            origin, axis = one.find("origin"), one.find("axis")
+            origin, axis, kind = one.find("origin"), one.find("axis"), one.attrib["type"]
             attributes = {} if origin is None else origin.attrib
-            turn = _rotation(*_three(attributes.get("rpy", "0 0 0")))
             direction = np.array([1.0, 0.0, 0.0] if axis is None else _three(axis.attrib["xyz"]))
-            length = float(np.linalg.norm(direction))
-            place = names.index(name) if name in names and one.attrib["type"] != "fixed" else -1
-            self._links.append(
-                (
-                    turn.ravel().tolist(),
-                    _three(attributes.get("xyz", "0 0 0")),
-                    (direction / (length or 1.0)).tolist(),
-                    place,
-                    one.attrib["type"] == "prismatic",
-                )
-            )
+            direction /= np.linalg.norm(direction) or 1.0
+            turn = _rotation(*_three(attributes.get("rpy", "0 0 0"))).ravel().tolist()
+            place = names.index(name) if name in names and kind != "fixed" else -1
+            offset = _three(attributes.get("xyz", "0 0 0"))
+            self._links.append((turn, offset, direction.tolist(), place, kind == "prismatic"))
             tip = one.find("parent").attrib["link"]
 
     def tip(self, joints: Sequence[float]) -> tuple[float, float, float]:
