@@ -146,7 +146,7 @@ def _run(options: argparse.Namespace) -> LoopReport:
         player.initialize()  # refuses unfit settings before anything is timed or moves
         robot: Robot = topics or (SimulatedRobot(contract) if make_robot is None else make_robot())
         stack.callback(getattr(robot, "close", lambda: None))
-        if topics is not None or make_robot is not None:
+        if topics is not None or make_robot is not None or options.trained_on is not None:
             require_match(contract, getattr(robot, "contract", None))
             _require_fit(options, agent, robot, guard.limits, say)
         recorder = None
