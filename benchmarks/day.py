@@ -416,7 +416,7 @@ def play_day(seed: int, hours: float, *, faults: bool = True, normal_step: float
 class CirclePolicy(Agent):
     """Moves all joints to and fro, from rest."""
 
-    contract: Contract | None = None  # type: ignore[assignment]
+    contract: Contract | None = None
 
     def __init__(self, joints: int) -> None:
         self.contract = Contract(action=ActionSpec(dim=joints, delta=False), chunk=CHUNK)
@@ -443,8 +443,8 @@ def limits_of(joints: int) -> Limits:
         Path(folder, "arm.urdf").write_text(f"<robot name='arm'>{links}</robot>")
         Path(folder, "arm.json").write_text('{"urdf": "arm.urdf", "tip": "7"}')
         read = Limits.read(Path(folder, "arm.json"))
-    cube = {"workspace_low": (-2.0, -2.0, -2.0), "workspace_high": (2.0, 2.0, 2.0)}
-    return replace(read, acceleration=LIMITS.acceleration, jerk=LIMITS.jerk, **cube)
+    dynamics = replace(read, acceleration=LIMITS.acceleration, jerk=LIMITS.jerk)
+    return replace(dynamics, workspace_low=(-2.0, -2.0, -2.0), workspace_high=(2.0, 2.0, 2.0))
 
 
 def tick_us(joints: int, ticks: int, *, part: str) -> list[float]:

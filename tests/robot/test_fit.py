@@ -156,7 +156,7 @@ def test_the_statistics_are_those_of_the_server_unless_a_file_is_named(caplog: p
     with caplog.at_level(logging.INFO):
         _require_fit(parse(["http://gpu-box:8000"]), agent, Standing(0.9, -1.9), None, said.append)
     assert said[0] in caplog.text
-    with pytest.raises(ContractMismatch, match=r"state\[1\]\S*: got 57"):
+    with pytest.raises(ContractMismatch, match=r"state\[1\] \(lift\): got 57"):
         _require_fit(parse(["http://gpu-box:8000"]), agent, Standing(57, 0), None, said.append)
     said.clear()
     _require_fit(parse(["http://gpu-box:8000"]), Still(weights=None), Standing(57, 0), None, said.append)

@@ -84,9 +84,11 @@ class Trained:
         """
         stated = [] if limits is None else [one.removesuffix(".pos") for one in limits.joints]
         found, names = [], [one.removesuffix(".pos") for one in names] or stated
-        for i, (ours, theirs) in enumerate(zip(names, stated, strict=False)):
+        for number, (ours, theirs) in enumerate(zip(names, stated, strict=False)):
             if ours != theirs and ours in stated:
-                found.append(f"joints: number {i} is {ours!r} of the arm and {theirs!r} of its limits; use one order")
+                found.append(
+                    f"joints: number {number} is {ours!r} of the arm and {theirs!r} of its limits; use one order"
+                )
         if self.state is not None and state is not None:
             found += _outside("state", state[np.newaxis], *self.state, names)
         if self.action is not None and chunk is not None:

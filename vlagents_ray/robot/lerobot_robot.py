@@ -69,7 +69,9 @@ class LeRobotRobot:
     def _limits_of(self, name: str) -> tuple[float, float]:
         if name in (stated := getattr(getattr(self._robot, "config", None), "joint_limits", None) or {}):
             return stated[name]  # type: ignore[no-any-return]
-        bus = getattr(self._robot, "bus", None)
+        bus: Any = getattr(self._robot, "bus", None)
+        motor: Any
+        ends: Any
         motor, ends = (getattr(bus, table, {}).get(name) for table in ("motors", "calibration"))
         mode = getattr(getattr(motor, "norm_mode", None), "name", "")
         if mode == "DEGREES" and ends is not None and hasattr(bus, "model_resolution_table"):

@@ -245,7 +245,7 @@ def _ranges(loaded: LoadedLeRobot) -> dict[str, Any] | None:
     for key, comparable in ((STATE, not loaded.trained.angles), (ACTION, not loaded.processors.whole)):
         known = loaded.processors.statistics(key) if comparable else {}
         for names in (("min", "max"), ("q01", "q99")):
-            if all(np.size(known.get(name)) and np.isfinite(known.get(name, np.nan)).all() for name in names):
+            if all(known.get(name) and np.isfinite(known[name]).all() for name in names):
                 found.setdefault(key, {name: known[name] for name in names})
     return {"parts": loaded.state, **found} if found else None
 
