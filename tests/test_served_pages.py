@@ -98,4 +98,4 @@ def test_a_block_works(page: Path, block: Block, host_of: Callable[[str | None],
 
 def test_there_are_such_blocks() -> None:
     assert {block.server for _, block in SERVED} >= {"noop", "random", "scripted", "deployments/openpi.yaml"}
-    assert len(TUTORIALS) == 5
+    assert len(TUTORIALS) == 6

@@ -192,7 +192,9 @@ class PolicyFailed(VLAgentsError):
 class InvalidAction(PolicyFailed):
     """The policy returned an action that must not reach a robot: not an array, a wrong shape, or NaN."""
 
-    def __init__(self, *args: object, cause: Literal["invalid", "limits", "max_step", "leader"] = "invalid") -> None:
+    def __init__(
+        self, *args: object, cause: Literal["invalid", "limits", "max_step", "dynamics", "leader"] = "invalid"
+    ) -> None:
         super().__init__(*args)
         self.cause = cause  # see `vlagents_ray.chunking.fallback.Cause`
 

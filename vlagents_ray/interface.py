@@ -122,6 +122,13 @@ class Agent:
     that of the files that `initialize` found by `vlagents_ray.policies.base.checkpoint.find_checkpoint`.
     """
 
+    statistics: dict[str, Any] | None = None
+    """Optional: ranges of the training's numbers as in LeRobot's `stats.json`, {"action": {"min": …, "max": …}, …}.
+
+    "parts" names the parts of the state in their order. A server's metadata have them among the `weights`, and
+    `vlagents-ray robot` compares them with the robot before its first motion.
+    """
+
     check: Callable[[np.ndarray, np.ndarray | None], np.ndarray] | None = None
     """Optional: a check that every action from `act` has passed, given the action and the previous one, (D,) each."""
 

@@ -253,6 +253,7 @@ _EXTRAS: dict[str, tuple[str, ...]] = {
         "grpc",
     ),
     "gr00t": ("zmq",),
+    "arms": ("mujoco_menagerie",),
     "bench": ("matplotlib",),
     "sim": ("gymnasium",),
     "record": ("av", "pyarrow"),

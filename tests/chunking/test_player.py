@@ -559,3 +559,13 @@ def test_a_player_is_driven_again_while_its_last_request_is_under_way(playing: P
     opener.join()
     assert isinstance(agent, Connected)
     assert not agent.overlapped
+
+
+def test_the_delay_of_a_cold_start_counts_only_until_the_next_answer(playing: Playing) -> None:
+    agent, player = playing(Counting(gated=True, rows=40), mode="async", real_time_chunking=True)
+    for t, ticks in ((0, 9), (9, 2), (11, 2), (13, 2)):
+        play(player, range(t, t + ticks))
+        let(agent, player)
+    play(player, range(15, 16))
+    wait_for(lambda: len(agent.seen) == 6)
+    assert [info.get(DELAY) for info in agent.seen[1:]] == [0, 8, 2, 2, 2]

@@ -174,6 +174,14 @@ def test_wrong_settings_are_refused_with_the_cure(words: list[str], cure: str) -
     assert cure in run.output
 
 
+def test_a_simulation_has_the_limits_of_a_file(tmp_path: Path) -> None:
+    (tmp_path / "slow.json").write_text('{"velocity": 1e-6}')
+    words = ["scripted", *QUICK, "--episodes", "1", "--hz", "200", "--limits", str(tmp_path / "slow.json")]
+    run = robot(*words)
+    assert run.exit_code == 1, run.output
+    assert "got velocity" in run.output
+
+
 def test_a_person_restarts_the_command_by_a_signal() -> None:
     said: list[str] = []
     stopped = threading.Event()

@@ -140,10 +140,12 @@ def test_what_keeps_the_inner_agent_from_acting_is_said_by_the_wrapper_too() -> 
 def test_what_an_agent_says_of_its_weights_is_said_through_a_wrapper() -> None:
     agent = Bright()
     agent.weights_id = {"digest": "x", "revision": None}
+    agent.statistics = {"action": {"min": [0.0], "max": [1.0]}}
     wrapped = Dim.around(agent, {})
     assert wrapped.weights_id is None
     wrapped.initialize()
     assert wrapped.weights_id == {"digest": "x", "revision": None}
+    assert wrapped.statistics == {"action": {"min": [0.0], "max": [1.0]}}
 
 
 def test_what_a_learner_trains_is_that_of_the_policy() -> None:

@@ -162,7 +162,7 @@ def check_command(words: list[str], where: str) -> None:
     if name == "make":
         command = ["make", "-C", str(ROOT), "--dry-run", *arguments]
     elif name == "vlagents-ray":
-        command = [name, *arguments[:1], "--help"]
+        command = [name, *arguments[: 2 if arguments[:2] == ["robot", "check"] else 1], "--help"]
     else:
         command = ["bash", "-c", f"type {shlex.quote(name)}"]
     done = subprocess.run(command, check=False, capture_output=True, text=True, env=ENV, timeout=60)

@@ -125,6 +125,12 @@ class ChunkBuffer:
         """The action to execute now; None if no chunk reaches that far."""
         return self._at(self.executed)
 
+    @property
+    def after(self) -> np.ndarray | None:
+        """The action behind `next`, (D,); None if no chunk reaches that far."""
+        step = self._at(self.executed + 1)
+        return None if step is None else step.action
+
     def advance(self) -> None:
         """Count `next`, or an action in its place, as executed."""
         self.executed += 1

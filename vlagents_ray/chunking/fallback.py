@@ -8,6 +8,7 @@ from typing import Literal, NamedTuple, get_args
 
 import numpy as np
 
+from vlagents_ray.chunking.ease import EaseIn
 from vlagents_ray.contract import ActionSpec, Contract
 from vlagents_ray.errors import (
     ConfigError,
@@ -29,7 +30,8 @@ Cause = Literal[
     "lost",  # the server did not answer: no connection, or not in time
     "failed",  # the policy raised an error
     "limits",  # the guard refused the action: beyond a limit
-    "max_step",  # the guard refused the action: too far from the last one
+    "max_step",  # the guard refused the action: too far from the last one, or too fast
+    "dynamics",  # the guard refused the action: too much acceleration or jerk
     "invalid",  # the action is NaN, has a wrong shape, or was refused by another check
     "leader",  # the operator's device gave no action
     "robot",  # the robot must not move (`holds`), for instance because a camera hangs
@@ -177,9 +179,15 @@ class Motion:
     def __init__(self, check: Check | None, contract: Contract | None = None, safe: SafeAction | None = None) -> None:
         self._check, self._contract, self._safe = check, contract, safe
         self.can_hold = safe is not None  # whether an action is known that keeps the robot still
+        self._ease: EaseIn | None = None  # while a motion begins from rest
         self._last: np.ndarray | None = None  # the last commanded action
         self._before: np.ndarray | None = None  # the last one of earlier ticks
         self._state: Literal["stopped", "moving", "held"] = "stopped"
+
+    @property
+    def speeds_up(self) -> bool:
+        """Whether the robot, coming from rest, is still slower than the plan."""
+        return self._ease is not None and self._ease.arrived and not self._ease.over
 
     def tick(self) -> None:
         """Begin a tick, at which one action may be commanded."""
@@ -187,11 +195,12 @@ class Motion:
 
     def stop(self) -> None:
         """Record that the robot was stopped, and did not execute a command of this tick."""
-        self._last = self._before
+        self._last, self._ease = self._before, None
         self._state = "stopped"
 
     def move(self, action: np.ndarray, obs: Obs) -> np.ndarray:
         """Return an action of policy or operator, (D,) float32; raises `InvalidAction` if it must not be sent."""
+        self._ease = None
         if self._state == "held":  # by the last target; the robot may have been moved since, or never have arrived
             with contextlib.suppress(InvalidAction):
                 self._last, self._state = self._checked(action, self._last), "moving"
@@ -200,10 +209,35 @@ class Motion:
         self._last, self._state = self._checked(action, last), "moving"
         return self._last
 
+    def follow(self, action: np.ndarray, after: np.ndarray | None, obs: Obs) -> tuple[np.ndarray, int]:
+        """Return the command on the way of a plan, (D,) float32, and the number of rows that it completes.
+
+        From rest, the check's `ease_in` leads the robot onto the plan; its rows wait meanwhile.
+
+        Args:
+            action: The next row, (D,).
+            after: The row behind it, (D,), if there is one.
+            obs: The current observation.
+
+        Raises:
+            InvalidAction: The command must not be sent.
+        """
+        ease_in = getattr(self._check, "ease_in", None)
+        if self._state != "moving" and ease_in is not None:
+            start = self._last if self._state == "held" else self._standing(obs)
+            if start is not None and (ease := ease_in(start, action)) is not None:
+                self._ease, self._last, self._state = ease, start, "moving"
+        if self._ease is None or self._ease.over:
+            return self.move(action, obs), 1
+        command, rows = self._ease.step(action, after)
+        self._last = self._checked(command, self._last)
+        return self._last, rows
+
     def hold(self, obs: Obs, why: Held) -> tuple[np.ndarray, Held]:
         """Return the action that keeps the robot still, (D,) float32, and why; raises `InvalidAction` without one."""
         if self._safe is None:
             raise InvalidAction(f"no action for this tick: {why.reason}")
+        self._ease = None
         last = self._standing(obs) if self._state == "stopped" else self._last
         try:
             action = self._checked(self._safe(obs, last), last)

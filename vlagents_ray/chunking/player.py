@@ -362,7 +362,9 @@ class ChunkPlayer(Agent):
         self._noted = True
 
     def _note_asked(self, tick: int, obs: Obs) -> None:
-        self._request, self._dropped = _Request(tick, self._plan.executed, self._captured(obs)), False
+        self._request = _Request(tick, self._plan.executed, self._captured(obs))
+        # A robot that speeds up is between two rows, so that the answer would begin up to a row away from it.
+        self._dropped = self._motion.speeds_up and self._plan.after is not None
 
     def _is_old(self, seen_at: float) -> bool:
         return self.settings.max_age_s is not None and seen_at < time.monotonic() - self.settings.max_age_s
@@ -390,7 +392,7 @@ class ChunkPlayer(Agent):
             return
         if isinstance(answer, Act):
             try:
-                if not self._dropped:
+                if not (self._dropped or (self._motion.speeds_up and self._plan.after is not None)):
                     self._take(answer, tick)
                 self._waiting_since = None
             except InvalidAction as error:
@@ -407,6 +409,8 @@ class ChunkPlayer(Agent):
         if self.settings.mode == "open_loop" and act.done and self.settings.execute is not None:
             # A late answer keeps one row, since the last row states that the task is done.
             rows = rows[: max(self.settings.execute, self._plan.executed + 1 - step)]
+        if self._chunks == 2:  # the first answer after that of `reset` may include a cold start, of seconds
+            self._delays.pop()
         self._delays.append(now - tick)
         added = self._plan.add(Chunk(self._chunks, step, rows, act.done, act.info, tick, seen_at))
         self._chunks += 1
@@ -444,14 +448,18 @@ class ChunkPlayer(Agent):
         why = held or (STALE if self._is_old(self._captured(obs)) else self._trouble)
         if step is not None:
             try:
-                action = self._motion.move(step.action, obs)
-                self._plan.advance()
-                return step.played(action, tick, self._silent_s())
+                action, rows = self._motion.follow(step.action, self._plan.after, obs)
             except InvalidAction as error:
                 self._plan.drop()  # the rest of the plan assumes the result of this action
                 why = refused(error)
                 if not self._motion.can_hold:
                     raise
+            else:
+                act = step.played(action, tick, self._silent_s())
+                if not rows:  # on the way to the row
+                    return replace(act, done=False)
+                self._plan.advance()
+                return act
         if held is not None and self.control.running:  # the loop commands nothing
             action = np.zeros(0, np.float32)
         else:

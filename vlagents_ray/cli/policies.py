@@ -66,45 +66,69 @@ def served(
             _enter_ray(stack)
         # Raise errors before anything starts.
         if address is None:
-            wanted = max(cell.worker.gpus for cell in cells(ready))
-            if wanted and wanted > (here := gpus_here()):  # Ray would never start these workers here
-                raise ConfigError(
-                    f"worker.gpus: a worker wants {wanted:g} GPUs, this machine has {here:g}; want less (0 draws in "
-                    f"software), or the --address of a cluster that has them"
-                )
-            for part in parts.values():
-                require_packages(part)
-        policy_contract = cache(lambda application: stated_contract(parts[application]))
-        for cell in cells(ready) if ready.real_robot is None else ():
-            application = str(cell.policy.url).removeprefix("serve://")
-            if application in parts and (env := known_contract(cell.env, cell.suite.env_options)) is not None:
-                try:
-                    require_match(policy_contract(application), env)
-                except ContractMismatch as error:
-                    raise ContractMismatch(f"{cell.policy.name!r} in {cell.env!r}: {error}") from None
+            _require_resources(ready, parts)
+        _require_fit(ready, parts)
         check(ready)
         if local is not None:
             if config.workers is None:
                 out.print("a short evaluation, in this process without Ray (--workers 1 plays it in a worker of Ray)")
-            # As in workers and replicas, for the same results.
-            hidden = {} if any(one.args[0].resources.num_gpus for one in local.values()) else {VISIBLE: ""}
-            stack.enter_context(variables(dict.fromkeys(THREAD_VARIABLES, str(ready.worker.threads)) | hidden))
-            apps = {one.name: str(one.url).removeprefix("serve://") for one in ready.policies}
-            agents = {name: local[app] for name, app in apps.items() if app in local}
-            own = [one.model_copy(update={"url": None}) if one.name in agents else one for one in ready.policies]
-            yield ready.model_copy(update={"policies": own, "workers": 0}), agents
+            yield _play_here(stack, ready, local)
             return
-        workers = config.workers or 1
+        ready = ready.model_copy(update={"workers": config.workers or 1})
         if parts:
-            from vlagents_ray.evaluate.workers.cluster import most_cpus, most_gpus
-            from vlagents_ray.serve.launch.server import running_server, spread_over_gpus
+            stack.enter_context(_on_ray(ready, parts, address, replica_per_gpu=replica_per_gpu))
+        yield ready, {}
 
-            if replica_per_gpu:
-                parts = spread_over_gpus(parts, kept=workers * most_gpus(ready))
-            # Ray's CPUs are logical here: the requested number of workers must fit.
-            cpus = max(os.cpu_count() or 1, math.ceil(workers * most_cpus(ready)))
-            stack.enter_context(running_server(together(parts), address=address, num_cpus=cpus, ingress=False))
-        yield ready.model_copy(update={"workers": workers}), {}
+
+def _require_resources(config: EvalConfig, parts: Mapping[str, Deployment]) -> None:
+    """Raise `ConfigError` or `MissingDependency` unless this machine has the GPUs and packages."""
+    wanted = max(cell.worker.gpus for cell in cells(config))
+    if wanted and wanted > (here := gpus_here()):  # Ray would never start these workers here
+        raise ConfigError(
+            f"worker.gpus: a worker wants {wanted:g} GPUs, this machine has {here:g}; want less (0 draws in "
+            f"software), or the --address of a cluster that has them"
+        )
+    for part in parts.values():
+        require_packages(part)
+
+
+def _require_fit(config: EvalConfig, parts: Mapping[str, Deployment]) -> None:
+    """Raise `ContractMismatch` unless the policies that will be served fit their simulations."""
+    policy_contract = cache(lambda application: stated_contract(parts[application]))
+    for cell in cells(config) if config.real_robot is None else ():
+        application = str(cell.policy.url).removeprefix("serve://")
+        if application in parts and (env := known_contract(cell.env, cell.suite.env_options)) is not None:
+            try:
+                require_match(policy_contract(application), env)
+            except ContractMismatch as error:
+                raise ContractMismatch(f"{cell.policy.name!r} in {cell.env!r}: {error}") from None
+
+
+def _play_here(
+    stack: contextlib.ExitStack, config: EvalConfig, local: Mapping[str, partial[LocalPolicy]]
+) -> tuple[EvalConfig, Agents]:
+    """Prepare this process to play the policies, with the variables of workers and replicas, for the same results."""
+    hidden = {} if any(one.args[0].resources.num_gpus for one in local.values()) else {VISIBLE: ""}
+    stack.enter_context(variables(dict.fromkeys(THREAD_VARIABLES, str(config.worker.threads)) | hidden))
+    apps = {one.name: str(one.url).removeprefix("serve://") for one in config.policies}
+    agents = {name: local[app] for name, app in apps.items() if app in local}
+    own = [one.model_copy(update={"url": None}) if one.name in agents else one for one in config.policies]
+    return config.model_copy(update={"policies": own, "workers": 0}), agents
+
+
+def _on_ray(
+    config: EvalConfig, parts: Mapping[str, Deployment], address: str | None, *, replica_per_gpu: bool
+) -> contextlib.AbstractContextManager[Any]:
+    """Return the context in which Ray serves the policies."""
+    from vlagents_ray.evaluate.workers.cluster import most_cpus, most_gpus
+    from vlagents_ray.serve.launch.server import running_server, spread_over_gpus
+
+    workers = config.workers or 1
+    if replica_per_gpu:
+        parts = spread_over_gpus(parts, kept=workers * most_gpus(config))
+    # Ray's CPUs are logical here: the requested number of workers must fit.
+    cpus = max(os.cpu_count() or 1, math.ceil(workers * most_cpus(config)))
+    return running_server(together(parts), address=address, num_cpus=cpus, ingress=False)
 
 
 def _enter_ray(stack: contextlib.ExitStack, address: str | None = None) -> None:

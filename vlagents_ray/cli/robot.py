@@ -2,6 +2,8 @@
 
 With --env a simulation is driven: by a policy, by an operator, or by a policy that an operator corrects.
 
+`vlagents-ray robot check ROBOT` checks a robot before a policy moves it.
+
 Exit status: 0 if every tick had an action of the policy, 1 if not, 3 if fewer than half had, 2 if it could not run.
 """
 
@@ -9,6 +11,7 @@ from __future__ import annotations
 
 import argparse
 import contextlib
+import logging
 import signal
 import sys
 import threading
@@ -22,14 +25,18 @@ from vlagents_ray.client.agent import RemoteAgent
 from vlagents_ray.client.commands import CommandInbox
 from vlagents_ray.contract import Contract, require_match
 from vlagents_ray.errors import ConfigError, VLAgentsError
-from vlagents_ray.robot.loop import ROBOT, LoopReport, Restart, Robot, import_class, run_loop
+from vlagents_ray.interface import Agent
+from vlagents_ray.robot.fit import Trained, require_fit
+from vlagents_ray.robot.limits import Limits
+from vlagents_ray.robot.loop import LoopReport, Restart, Robot, import_class, robot_named, run_loop
 from vlagents_ray.robot.record import Recorder
 from vlagents_ray.robot.ros import RosRobot, read_settings
-from vlagents_ray.robot.safety import Guard, Watchdog, measured_state
+from vlagents_ray.robot.safety import SOFT_START_S, Guard, Watchdog, measured_state
 from vlagents_ray.robot.simulated import SimulatedRobot
 from vlagents_ray.robot.teleoperation import HELP, AxesLeader, Keyboard, SpaceMouse, Terminal
 from vlagents_ray.viewers import open_viewer
 
+logger = logging.getLogger(__name__)
 MOSTLY_SAFE = 3  # exit status
 WAIT_S = 1.0  # deadline of a tick in the modes that wait for an answer; half of the default of --silent-s
 _DEVICES: dict[str, type[Keyboard | SpaceMouse]] = {"keyboard": Keyboard, "spacemouse": SpaceMouse}
@@ -40,7 +47,12 @@ _HEADER = ("", "ticks", "missed", "within 2 ms", "p50 ms", "p99 ms", "max ms")
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command, and return its exit status."""
-    options = parse(arguments)
+    given = sys.argv[1:] if arguments is None else arguments
+    if given[:1] == ["check"]:
+        from vlagents_ray.cli.robot_check import main as check
+
+        return check(given[1:])
+    options = parse(given)
     if options.env is not None:
         from vlagents_ray.cli.simulated_robot import drive
 
@@ -98,7 +110,7 @@ def _run(options: argparse.Namespace) -> LoopReport:
     deadline_s = 0.0 if options.mode == "async" else WAIT_S
     if options.deadline_ms is not None:
         deadline_s = options.deadline_ms / 1e3
-    make_robot = import_class("--robot", options.robot, ROBOT) if options.robot else None
+    make_robot = robot_named("--robot", options.robot, options.robot_set) if options.robot else None
     make_leader = import_class("--leader", options.leader) if ":" in (options.leader or "") else None
     with contextlib.ExitStack() as stack:
         topics = None if options.ros is None else stack.enter_context(RosRobot(read_settings(options.ros)))
@@ -122,10 +134,21 @@ def _run(options: argparse.Namespace) -> LoopReport:
             max_age_s=options.max_age_s,
             safe=options.safe,
         )
-        guard = Guard(contract, max_step=options.max_step, measure=measured_state(options.measure))
+        guard = Guard(
+            contract,
+            max_step=options.max_step,
+            measure=measured_state(options.measure),
+            limits=options.limits,
+            hz=hz,
+            soft_start_s=options.soft_start_s,
+        )
         player = stack.enter_context(ChunkPlayer(agent, settings, check=guard, override=leader))
         player.initialize()  # refuses unfit settings before anything is timed or moves
         robot: Robot = topics or (SimulatedRobot(contract) if make_robot is None else make_robot())
+        stack.callback(getattr(robot, "close", lambda: None))
+        if topics is not None or make_robot is not None or options.trained_on is not None:
+            require_match(contract, getattr(robot, "contract", None))
+            _require_fit(options, agent, robot, guard.limits, say)
         recorder = None
         if options.record:
             recorder = stack.enter_context(Recorder(options.record, hz, interventions=leader is not None))
@@ -139,7 +162,6 @@ def _run(options: argparse.Namespace) -> LoopReport:
         silent_s = {"server": options.silent_s, "loop": hangs_s}
         watchdog = Watchdog(stop, silent_s if topics is None else {**topics.silent_s, **silent_s})
         if topics is not None:
-            require_match(contract, topics.contract)
             topics.watchdog = watchdog
         stack.enter_context(_restarting(watchdog, say))
         report = run_loop(
@@ -168,6 +190,24 @@ def _run(options: argparse.Namespace) -> LoopReport:
     if viewer is not None:
         say(viewer.report())
     return report
+
+
+def _require_fit(
+    options: argparse.Namespace, agent: Agent, robot: Robot, limits: Limits | None, say: Callable[[str], None]
+) -> None:
+    """Show the first chunk beside the training of the checkpoint and the limits of the arm, and compare them."""
+    stated = (getattr(agent, "metadata", {}).get("weights") or {}).get("statistics")
+    if options.trained_on is None and stated is None and limits is None:
+        return
+    trained = Trained.from_statistics(stated or {}) if options.trained_on is None else Trained.read(options.trained_on)
+    obs, contract, names = robot.observe(), agent.contract or Contract(), getattr(robot, "joint_names", ())
+    agent.reset(obs, options.instruction)
+    chunk = agent.act(obs).rows()
+    for line in trained.drawn(chunk, limits, names):
+        say(line)
+        logger.info("%s", line)
+    state = trained.vector(obs, [*(contract.state or {}), *(["gripper"] if contract.gripper else [])])
+    require_fit(trained.misfits(state, chunk, limits, names), accept=options.accept_misfit)
 
 
 def _leader(
@@ -275,10 +315,10 @@ def command_parser() -> tuple[argparse.ArgumentParser, list[argparse.Action], li
     add("--hz", type=seconds, help=f"control rate (default: {_HZ:g}, or the environment's)")
     real("--seconds", type=seconds, default=60.0, help="how long (%(default)s)")
     real("--instruction", help="the task in words")
-    real("--robot", metavar="MODULE:CLASS", help="your robot's class, without arguments; default: a simulated one")
+    real("--robot", metavar="MODULE:CLASS", help="your class, lerobot:TYPE or mujoco:ARM; default: a simulated one")
+    real("--robot-set", metavar="KEY=VALUE", action="append", default=[], help="an argument of the robot, repeatable")
     real("--ros", metavar="FILE", help="a robot behind topics of ROS 2, from this file; see docs/ros.md")
-    leaders = "device for taking over: keyboard, spacemouse, or, without --env, your MODULE:CLASS, see Leader"
-    add("--leader", metavar="LEADER", help=leaders)
+    add("--leader", metavar="LEADER", help="device for taking over: keyboard, spacemouse, or your MODULE:CLASS")
     add("--step", type=seconds, help="what a key or axis of these adds to a number of the action at a tick")
     add("--mode", choices=get_args(Mode), help="see PlayerSettings (default: async; with --env open_loop)")
     add("--execute", type=rows, metavar="N", help="rows of a chunk to execute before asking again")
@@ -293,6 +333,13 @@ def command_parser() -> tuple[argparse.ArgumentParser, list[argparse.Action], li
     real("--safe", choices=("auto", "hold", "zero"), default="auto", help=safe)
     add("--max-step", type=_number(), help="largest change of a number of the action from one tick to the next")
     real("--measure", metavar="PART", help="part of the state with the measured pose, for --max-step, e.g. joints")
+    limits = "limits of motion: a .yaml or .json file, a LeRobotDataset or a .urdf; see docs/control_loop.md"
+    add("--limits", metavar="PATH", help=limits)
+    soft = "time of motion in which these rise from half of their values (%(default)s; 0: none)"
+    add("--soft-start-s", type=_number(), default=SOFT_START_S, help=soft)
+    trained = "file with statistics of the training, which arm and first chunk must fit (default: the server's, if any)"
+    real("--trained-on", metavar="FILE", help=trained)
+    real("--accept-misfit", action="store_true", help="move although they do not fit; the log shows it")
     restarts = "how motion restarts after a stop: by Enter, C or SIGUSR1, or by itself (manual; auto if simulated)"
     real("--restart", choices=get_args(Restart), help=restarts)
     silence = "stop the robot when the server is silent this long (%(default)s)"

@@ -103,7 +103,14 @@ class RobotRun:
             env = stack.enter_context(make_env(self.options.env, **self._env_options))
             hz = self.options.hz or env.contract.control_hz or _HZ
             leader = self._leader(env.contract, stack)
-            agent = stack.enter_context(self._agent(env.contract, leader))
+            guard = Guard(
+                env.contract,
+                max_step=self.options.max_step,
+                limits=self.options.limits,
+                hz=hz,
+                soft_start_s=self.options.soft_start_s,
+            )
+            agent = stack.enter_context(self._agent(env.contract, leader, guard))
             self._control = agent.control
             if self.options.record is not None:
                 opened = Recorder(self.options.record, hz, interventions=leader is not None)
@@ -115,14 +122,14 @@ class RobotRun:
             for seed in seeds:
                 if self.over:
                     break
-                self._play(env, agent, seed, hz)
+                self._play(env, agent, seed, hz, guard)
         if (recorder := self.recorder) is not None:  # closed, so everything is written
             kept = f"{recorder.episodes} episodes in {self.options.record}"
             out.print(f"recorded: {kept}, {recorder.dropped} frames dropped")
         if self._viewer is not None:
             out.print(self._viewer.report())
 
-    def _play(self, env: EvalEnv, agent: Agent, seed: int, hz: float) -> None:
+    def _play(self, env: EvalEnv, agent: Agent, seed: int, hz: float, guard: Guard) -> None:
         self.verdict, recorder = None, self.recorder
         robot = EnvRobot(env, seed, endless=self.options.leader is not None)
         out.print(f"seed {seed}: {env.instruction}")
@@ -137,14 +144,13 @@ class RobotRun:
             return robot.ended or self.verdict is not None
 
         options = {} if self.options.policy is None else {"seed": seed, "env": self.options.env}
-        guard = Guard(env.contract, max_step=self.options.max_step) if self.options.policy is None else None
         report = run_loop(
             robot,
             agent,
             hz=hz,
             instruction=env.instruction,
             reset_options=options,
-            guard=guard,
+            guard=guard if self.options.policy is None else None,
             recorder=recorder,
             viewer=self._viewer,
             until=ended,
@@ -166,7 +172,7 @@ class RobotRun:
             device = stack.enter_context(SpaceMouse())
         return AxesLeader(contract, device, step=self.options.step)
 
-    def _agent(self, contract: Contract, leader: Leader | None) -> Agent:
+    def _agent(self, contract: Contract, leader: Leader | None, guard: Guard) -> Agent:
         if self.options.policy is None:
             if leader is None:
                 raise ConfigError("robot: got neither a policy nor --leader, want one of them, or both")
@@ -182,7 +188,7 @@ class RobotRun:
         require_match(inner.contract, contract)
         given = self.options
         settings = PlayerSettings(given.mode, given.execute)
-        return ChunkPlayer(policy, settings, check=Guard(contract, max_step=given.max_step), override=leader)
+        return ChunkPlayer(policy, settings, check=guard, override=leader)
 
     def _pause(self) -> None:
         if self._control is None:

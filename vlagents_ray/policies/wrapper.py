@@ -64,7 +64,7 @@ class Wrapper(Agent, abc.ABC):
 
     def initialize(self) -> None:
         self.agent.initialize()
-        self.weights_id = self.agent.weights_id
+        self.weights_id, self.statistics = self.agent.weights_id, self.agent.statistics
 
     def reset(self, obs: Obs, instruction: str | None, **kwargs: Any) -> dict[str, Any]:
         return self.agent.reset(self.begin(obs, instruction), instruction, **kwargs)

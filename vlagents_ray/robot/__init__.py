@@ -2,7 +2,8 @@
 
 from vlagents_ray.chunking.control import Control
 from vlagents_ray.client.commands import CommandInbox
+from vlagents_ray.robot.limits import Limits
 from vlagents_ray.robot.loop import LoopReport, Robot, run_loop
 from vlagents_ray.robot.safety import Guard, Watchdog
 
-__all__ = ["CommandInbox", "Control", "Guard", "LoopReport", "Robot", "Watchdog", "run_loop"]
+__all__ = ["CommandInbox", "Control", "Guard", "Limits", "LoopReport", "Robot", "Watchdog", "run_loop"]

@@ -5,13 +5,15 @@ from __future__ import annotations
 import contextlib
 import gc
 import importlib
+import json
 import logging
 import math
 import os
 import time
 from collections import deque
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 from typing import Any, Literal, Protocol, get_args
 
 import numpy as np
@@ -31,6 +33,10 @@ logger = logging.getLogger(__name__)
 
 _COLLECT_S = 2.0
 ROBOT = ("observe", "apply", "stop")  # the methods of a `Robot`
+_ADAPTERS = {
+    "mujoco": "vlagents_ray.robot.mujoco_arm:MujocoArm",
+    "lerobot": "vlagents_ray.robot.lerobot_robot:LeRobotRobot",
+}
 
 
 class Robot(Protocol):
@@ -39,6 +45,11 @@ class Robot(Protocol):
     A simulated robot may have the attribute `simulated = True`: it starts again by itself after a stop (see `restart`
     of `run_loop`). A robot may have an attribute `holds`, the reason why it must not move now, such as a camera that
     hangs. While it is not None the robot is stopped; then the loop continues with a new observation.
+
+    `vlagents-ray robot`, its `check` and `vlagents_ray.robot.check.examine` use further attributes of a robot that has
+    them: `contract`, what it gives and takes; `joint_names`, its joints in the order of an action, without grippers;
+    `joint_limits`, (D, 2) in their units; of a simulated one `operator`, a `vlagents_ray.robot.check.Operator` in place
+    of the person at the robot, and `clock`, the module `time` of its simulation; and `close`, called at the end.
     """
 
     def observe(self) -> Obs:
@@ -73,6 +84,25 @@ def import_class(option: str, name: str, methods: Sequence[str] = ()) -> Any:
     if missing := [method for method in methods if not callable(getattr(found, method, None))]:
         raise ConfigError(f"{option} {name}: lacks {', '.join(missing)}; want a class with {', '.join(methods)}")
     return found
+
+
+def robot_named(option: str, name: str, settings: Iterable[str] = ()) -> Callable[..., Robot]:
+    """Return what makes a robot: "module:Class", or an adapter and its argument, such as "lerobot:so101_follower".
+
+    The `settings` are further arguments as KEY=VALUE, of which the value is JSON or else text. Raises `ConfigError`.
+    """
+    given: dict[str, Any] = {}
+    for text in settings:
+        key, equals, value = text.partition("=")
+        if not equals:
+            raise ConfigError(f"{option}-set: got {text!r}, want KEY=VALUE, as in port=/dev/ttyACM0")
+        try:
+            given[key] = json.loads(value)
+        except json.JSONDecodeError:
+            given[key] = value
+    adapter, _, first = name.partition(":")
+    first_argument = (first,) if adapter in _ADAPTERS else ()
+    return partial(import_class(option, _ADAPTERS.get(adapter, name), ROBOT), *first_argument, **given)
 
 
 @dataclass(slots=True)
@@ -143,7 +173,9 @@ def run_loop(
 ) -> LoopReport:
     """Reset an agent and let it drive a robot at a fixed rate, until it is done or the time is over.
 
-    The schedule is absolute, so there is no drift; a tick that is over before it could begin is skipped and counted as
+    With the rest pose of `Guard.limits`, the robot goes there slowly after a run that ended without a stop, a pause, a
+    mark or an exception; a mark may come from afar, from where a robot can only be made to stop. The schedule is
+    absolute, so there is no drift; a tick that is over before it could begin is skipped and counted as
     missed. `robot.stop()` is called however the loop ends. If more than half of the ticks had no action of the policy,
     `LoopReport.mostly_safe` is logged as a warning. Signals such as SIGTERM end the loop if the caller turns them into
     an exception.
@@ -176,8 +208,8 @@ def run_loop(
         The timing of the loop, and the reasons of the ticks without an action of the policy.
 
     Raises:
-        ConfigError: `hz`, `seconds` or `restart` has a wrong value, `guard` differs from the agent's own, or the
-            recorder has no columns for interventions.
+        ConfigError: `hz`, `seconds` or `restart` has a wrong value, `guard` differs from the agent's own or has limits
+            for another rate, or the recorder has no columns for interventions.
         InvalidAction: An action is a chunk, or the guard refuses it.
     """
     if restart is None:
@@ -206,6 +238,8 @@ def run_loop(
     if guard is not None and own is not None and own is not guard:
         raise ConfigError("guard: got one besides the agent's own check=, want one of them; leave one out")
     guard = guard or own or Guard(agent.contract)
+    if guard.hz not in (None, hz):
+        raise ConfigError(f"guard: got limits for {guard.hz} Hz in a loop of {hz} Hz, want the same rate")
     run = _Run(robot, agent, control, guard, watchdog, recorder, commands, LoopView(viewer), report)
     with contextlib.ExitStack() as stack:
         control.begin(auto=restart == "auto")
@@ -217,7 +251,9 @@ def run_loop(
             report.means = stack.enter_context(undisturbed(real_time=real_time))
             if watchdog is not None:
                 stack.enter_context(watchdog)
-            run.drive(Pacer(hz), seconds, until)
+            pacer = Pacer(hz)
+            run.drive(pacer, seconds, until)
+            run.go_to_rest(pacer)
             report.outcome = control.end()
             if report.outcome and recorder is not None and recorder.interventions:
                 recorder.label("success" if report.outcome == "success" else "failure")
@@ -297,6 +333,24 @@ class _Run:
             if work_s:
                 self.report.work_p50_ms = float(np.median(work_s)) * 1e3
                 self.report.work_p99_ms = float(np.quantile(work_s, 0.99)) * 1e3
+
+    def go_to_rest(self, pacer: Pacer) -> None:
+        """Move slowly to the guard's rest pose, unless the robot is held or the episode was marked."""
+        if (last := self.last) is None or self.standing:
+            return
+        try:
+            for command in self.guard.way_to_rest(last):
+                pacer.wait()
+                self.control.update()
+                if self._held(Act(last)) is not None or self.control.state == "human" or self.control.over:
+                    break
+                if self.watchdog is not None:
+                    self.watchdog.heard("loop")
+                    self.watchdog.heard("server")  # not needed for this motion
+                last = self.guard(command, last)
+                self.robot.apply(last)
+        except InvalidAction as error:
+            logger.warning("the way to the rest pose ends here: %s", error)
 
     def _held(self, act: Act) -> Held | None:
         """Obey new commands; return why this tick may command nothing, or None."""

@@ -2,17 +2,25 @@
 
 from __future__ import annotations
 
+import functools
 import math
 import threading
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from pathlib import Path
 
 import numpy as np
 
 from vlagents_ray.chunking.control import Control
+from vlagents_ray.chunking.ease import EaseIn
 from vlagents_ray.contract import ActionSpec, Contract
 from vlagents_ray.errors import ConfigError, InvalidAction, MissingState
 from vlagents_ray.interface import Obs
+from vlagents_ray.robot.limits import Limits
+
+SOFT_START_S = 120.0
+_FIRST_S = 0.5  # of the limit of velocity: how far the first action may be
+_SLOWLY = 2.0  # how many times longer than its limits require the way from rest to the first action takes
 
 
 class Guard:
@@ -24,17 +32,26 @@ class Guard:
     Without it the first action may be anywhere within the bounds, and one after a stop is compared with the last
     action.
 
+    With `limits`, speed, acceleration and jerk are also checked, and the position of the tip. Braking is always
+    allowed, as the robot's own stop is harder. A chunk player then eases each motion in from rest
+    (`vlagents_ray.chunking.ease`), as rows of a plan that continue at full speed could not be reached in one tick.
+
     Args:
         contract: The policy's contract, for the action's dimension and bounds; None checks neither.
-        low: Lower bound, for all numbers of an action or (D,), in the action's units; the stricter of this and the
-            contract's applies.
+        low: Lower bound, for all numbers of an action or (D,), in the action's units; the strictest of this, the
+            contract's and that of `limits` applies.
         high: Upper bound, as `low`.
         max_step: Largest difference between two consecutive actions, for all numbers or (D,); None checks none.
         measure: Returns the measured pose in an observation, (D,) in the action's order and units, e.g.
             `lambda obs: obs.state["joints"]`; not for relative actions.
+        limits: The limits of the robot's motion, or the path that `Limits.read` reads.
+        hz: The control rate, Hz; needed with `limits`.
+        soft_start_s: The time of motion, s, within which the limits of speed, acceleration and jerk rise from half to
+            their values, since most accidents happen in the first minutes of a new checkpoint; 0 for none.
 
     Raises:
-        ConfigError: A bound is NaN, `max_step` is negative, or `measure` is given for relative actions.
+        ConfigError: A bound is NaN, `max_step` is negative, `measure` is given for relative actions, or `limits`
+            without `hz`.
     """
 
     def __init__(
@@ -45,11 +62,19 @@ class Guard:
         high: float | np.ndarray | None = None,
         max_step: float | np.ndarray | None = None,
         measure: Callable[[Obs], np.ndarray] | None = None,
+        limits: Limits | str | Path | None = None,
+        hz: float | None = None,
+        soft_start_s: float = SOFT_START_S,
     ) -> None:
         spec = contract.action if contract is not None else ActionSpec()
+        self.limits = limits = Limits.read(limits) if isinstance(limits, (str, Path)) else limits
+        self.hz = hz
         self._dim = spec.dim
-        self._low = _bounds("low", max, spec.low, low)
-        self._high = _bounds("high", min, spec.high, high)
+        self._relative = bool(spec.relative)
+        own = limits or Limits()
+        bounds = (None, None) if self._relative else (own.low, own.high)  # of poses
+        self._low = _bounds("low", np.maximum, spec.low, low, bounds[0])
+        self._high = _bounds("high", np.minimum, spec.high, high, bounds[1])
         self._max_step = None if max_step is None else np.asarray(max_step, np.float64)
         if self._max_step is not None and not (self._max_step >= 0).all():  # with NaN any step would pass
             raise ConfigError(f"max_step: got {max_step}, want 0 or above, or None")
@@ -57,7 +82,19 @@ class Guard:
             raise ConfigError(
                 "measure: got one for relative actions, which cannot be compared with a pose; leave it out"
             )
+        if limits is not None and (hz is None or not hz > 0 or not soft_start_s >= 0):
+            raise ConfigError(
+                f"limits: got hz={hz}, soft_start_s={soft_start_s}, want the control rate, and 0 s or more"
+            )
         self._measure = measure
+        self._soft_ticks = soft_start_s * (hz or 0.0)
+        self._moved = 0  # ticks of motion
+        self._columns: list[list[float]] = []  # low, high, max_step, velocity, acceleration, jerk; units and ticks
+        self._then: list[float] | None = None  # the last accepted action; None at rest
+        self._speed: list[float] = []  # its change from the one before, units a tick
+        self._change: list[float] = []  # the change of that
+        if self._dim is not None:
+            self._limits_of(self._dim)
 
     def reference(self, obs: Obs, last: np.ndarray | None) -> np.ndarray | None:
         """Return the pose with which the first action, or the first one after a stop, is compared.
@@ -73,6 +110,7 @@ class Guard:
             ConfigError: `measure` returns another number of values than an action has.
             InvalidAction: `measure` returns NaN or infinity, so that no action can be checked.
         """
+        self._then = None
         if self._measure is None:
             return last
         pose = np.asarray(self._measure(obs), np.float32)
@@ -88,7 +126,7 @@ class Guard:
 
         Args:
             action: The action, (D,) float32.
-            last: The action or pose from which `max_step` counts, (D,); None skips that check.
+            last: The action or pose from which the motion begins, (D,); None skips the checks of steps and speeds.
 
         Returns:
             The action, unchanged.
@@ -100,28 +138,142 @@ class Guard:
         if action.ndim != 1 or action.dtype.kind != "f" or self._dim not in (None, len(action)):
             wanted = f"({self._dim if self._dim is not None else 'D'},) float32"
             raise InvalidAction(f"action: got {action.shape} {action.dtype}, want {wanted}, a single row")
-        if not np.isfinite(action).all():
-            raise InvalidAction(f"action: got {action.tolist()}, want finite numbers; the policy's output is broken")
-        for name, bound, wrong in (("below", self._low, np.less), ("above", self._high, np.greater)):
-            if bound is not None and (over := wrong(action, bound)).any():
-                i = int(np.argmax(over))
-                limit = float(np.broadcast_to(bound, action.shape)[i])
+        now = action.tolist()  # plain floats: for so few numbers they are faster than numpy
+        if not all(map(math.isfinite, now)):
+            raise InvalidAction(f"action: got {now}, want finite numbers; the policy's output is broken")
+        low, high, steps, *dynamic = self._limits_of(len(now))
+        for i, number in enumerate(now):
+            if not low[i] <= number <= high[i]:
+                name, limit = ("below", low[i]) if number < low[i] else ("above", high[i])
                 raise InvalidAction(
-                    f"action[{i}]: got {action[i]:g}, {name} the limit {limit:g}; see the contract", cause="limits"
+                    f"action[{i}]: got {number:g}, {name} the limit {limit:g}; see the contract", cause="limits"
                 )
-        if self._max_step is not None and last is not None:
-            if last.shape != action.shape:
+        if self.limits is not None and not self._relative:
+            self._check_workspace(now)
+        if last is None:
+            self._then, self._speed, self._change = now, [0.0] * len(now), [0.0] * len(now)
+            return action
+        if last.shape != action.shape:
+            raise InvalidAction(f"action: got {action.shape} after {np.shape(last)}, want as many numbers as before")
+        then = last.tolist()
+        for i, number in enumerate(now):
+            if abs(number - then[i]) > steps[i]:
                 raise InvalidAction(
-                    f"action: got {action.shape} after {np.shape(last)}, want as many numbers as before"
-                )
-            excess = np.abs(action.astype(np.float64) - last) - self._max_step
-            if (excess > 0).any():
-                i = int(np.argmax(excess))
-                raise InvalidAction(
-                    f"action[{i}]: got {action[i]:g} after {last[i]:g}, a larger step than max_step allows",
+                    f"action[{i}]: got {number:g} after {then[i]:g}, a larger step than max_step allows",
                     cause="max_step",
                 )
+        if self.limits is not None:
+            self._check_dynamics(now, then, dynamic)
         return action
+
+    def ease_in(self, start: np.ndarray, goal: np.ndarray, *, far: bool = False) -> EaseIn | None:
+        """Plan the ease-in from a pose at rest to an action.
+
+        Args:
+            start: The pose at rest, (D,) in the action's units.
+            goal: The first action, (D,).
+            far: Whether the distance is not checked.
+
+        Returns:
+            The ease-in; None without limits of speed.
+
+        Raises:
+            InvalidAction: The action is farther from the pose than `Limits.first`.
+        """
+        if self.limits is None or self.limits.velocity is None or start.shape != goal.shape:
+            return None
+        tightened, (*_, velocity, acceleration, jerk) = self._softness(), self._limits_of(len(goal))
+        ramp = approach = 0.0
+        near = True
+        first = np.broadcast_to(np.inf if self.limits.first is None else self.limits.first, start.shape)
+        for i, way in enumerate(np.abs(goal.astype(np.float64) - start).tolist()):
+            v, a, j = (tightened * one[i] for one in (velocity, acceleration, jerk))
+            allowed = min(float(first[i]), velocity[i] * (self.hz or 0.0) * _FIRST_S)
+            if not (far or self._relative) and way > allowed:
+                raise InvalidAction(
+                    f"action[{i}]: got {goal[i]:g} as the first action, {way:g} from the pose {start[i]:g}, want "
+                    f"{allowed:.3g} at most; is it another arm's or in another order or unit? Else raise `first`",
+                    cause="max_step",
+                )
+            if v < math.inf:  # the policy's own acceleration needs the other half
+                ramp = max(ramp, 2 * v / a, 2 * v / j)
+            near = near and way <= v
+            # The peaks of the quintic over T ticks: 1.875 D / T, 5.7735 D / T^2, 60 D / T^3.
+            slow = (1.875 * way / v, math.sqrt(5.7735 * way / a), (60 * way / j) ** (1 / 3))
+            approach = max(approach, *(one * _SLOWLY for one in slow))
+        ticks = 0 if near or self._relative else math.ceil(approach)
+        return EaseIn(start, ticks, 2 * math.ceil(ramp / 2), relative=self._relative)
+
+    def way_to_rest(self, last: np.ndarray) -> Iterator[np.ndarray]:
+        """Yield the commands, (D,) float32, of the slow way from the last one to the rest pose, if `limits` has one."""
+        if self.limits is None or self.limits.rest is None or self._relative:
+            return
+        rest = np.array(self.limits.rest, np.float32)
+        ease = self.ease_in(last, rest, far=True)
+        yield last  # the way begins at rest
+        while ease is not None and not ease.arrived:
+            command, _ = ease.step(rest, None)
+            yield command
+
+    def _limits_of(self, dim: int) -> list[list[float]]:
+        if not self._columns or len(self._columns[0]) != dim:
+            limits, tick_s = self.limits or Limits(), 1.0 / (self.hz or 1.0)
+            of_time = (limits.velocity, limits.acceleration, limits.jerk)
+            given = [(self._low, -math.inf), (self._high, math.inf), (self._max_step, math.inf)]
+            try:
+                found = [np.broadcast_to(other if one is None else one, dim).tolist() for one, other in given]
+                for order, one in enumerate(of_time, 1):
+                    limit = np.broadcast_to(math.inf if one is None else np.asarray(one, np.float64), dim)
+                    # Float32 rounds a step of 0.1 between two targets to slightly more.
+                    found.append((limit * tick_s**order * (1 + 1e-4) + 1e-6).tolist())
+            except ValueError as error:
+                raise ConfigError(f"limits: {error}; want one number, or {dim} as an action has") from error
+            self._columns = found
+        return self._columns
+
+    def _softness(self) -> float:
+        """Return the share of the limits of speed, acceleration and jerk that applies now."""
+        return 1.0 if self._moved >= self._soft_ticks else 0.5 + 0.5 * self._moved / self._soft_ticks
+
+    def _check_dynamics(self, now: list[float], then: list[float], limits: Sequence[list[float]]) -> None:
+        zeros = [0.0] * len(now)
+        speeds, changes = (zeros, zeros) if then != self._then else (self._speed, self._change)
+        moved = now if self._relative else [a - b for a, b in zip(now, then, strict=True)]
+        share = self._softness()
+        for i, (v, u, c, *limit) in enumerate(zip(moved, speeds, changes, *limits, strict=True)):
+            if abs(v) > share * limit[0]:
+                raise self._refusal("velocity", i, v, share * limit[0], 1)
+            if abs(v) <= abs(u) and v * u >= 0.0:  # it brakes
+                continue
+            if abs(v - u) > share * limit[1]:
+                raise self._refusal("acceleration", i, v - u, share * limit[1], 2)
+            if abs(v - u - c) > share * limit[2]:
+                raise self._refusal("jerk", i, v - u - c, share * limit[2], 3)
+        # After a tick at rest, the deceleration before it is over.
+        self._change = [v - u for v, u in zip(moved, speeds, strict=True)] if any(moved) else zeros
+        self._then, self._speed = now, moved
+        self._moved += any(moved)
+
+    def _refusal(self, what: str, i: int, got: float, limit: float, order: int) -> InvalidAction:
+        per_s = (self.hz or 1.0) ** order
+        soft = "" if self._moved >= self._soft_ticks else ", which the soft start lowers"
+        return InvalidAction(
+            f"action[{i}]: got {what} {got * per_s:.4g}, want {limit * per_s:.3g} at most (units/s^{order}{soft})",
+            cause="max_step" if order == 1 else "dynamics",
+        )
+
+    def _check_workspace(self, now: list[float]) -> None:
+        limits = self.limits
+        if limits is None or limits.chain is None:
+            return
+        tip = limits.chain.tip(now)
+        for bound, wrong, name in ((limits.workspace_low, 1, "below"), (limits.workspace_high, -1, "above")):
+            for axis, place, limit in zip("xyz", tip, bound or tip, strict=True):
+                if wrong * (limit - place) > 0:
+                    raise InvalidAction(
+                        f"action: the tip would be at {axis} = {place:.3f} m, {name} the workspace's {limit:g} m",
+                        cause="limits",
+                    )
 
 
 def measured_state(part: str | None) -> Callable[[Obs], np.ndarray] | None:
@@ -135,16 +287,12 @@ def measured_state(part: str | None) -> Callable[[Obs], np.ndarray] | None:
     return None if part is None else measured
 
 
-def _bounds(
-    name: str, stricter: Callable[[float, float], float], stated: float | None, own: float | np.ndarray | None
-) -> np.ndarray | None:
-    """Return the stricter of both bounds as float32, the type of actions, so that a bound of 0.1 accepts 0.1."""
-    given = [np.asarray(one, np.float32) for one in (stated, own) if one is not None]
-    if not given:
-        return None
-    if any(np.isnan(one).any() for one in given):
-        raise ConfigError(f"{name}: got {own}, want numbers")
-    return given[0] if len(given) == 1 else np.vectorize(stricter, otypes=[np.float32])(*given)
+def _bounds(name: str, stricter: np.ufunc, *given: float | np.ndarray | tuple[float, ...] | None) -> np.ndarray | None:
+    """Return the strictest of the bounds as float32, the type of actions, so that a bound of 0.1 accepts 0.1."""
+    stated = [np.asarray(one, np.float32) for one in given if one is not None]
+    if any(np.isnan(one).any() for one in stated):
+        raise ConfigError(f"{name}: got {given}, want numbers")
+    return functools.reduce(stricter, stated) if stated else None
 
 
 class Watchdog:
@@ -176,7 +324,7 @@ class Watchdog:
         self._stop = stop
         self._limits = dict(silent_s)
         self._heard = dict.fromkeys(silent_s, 0.0)
-        self._changed = threading.Condition()
+        self._changed = threading.Condition()  # reentrant
         self._thread: threading.Thread | None = None
 
     def heard(self, name: str, ago_s: float = 0.0) -> None:
@@ -250,6 +398,30 @@ class Watchdog:
     def __exit__(self, *exc: object) -> None:
         self.close()
 
+    def overdue(self) -> tuple[str | None, float | None]:
+        """Record the silence of a source whose time limit is over, and return its reason, for `bark`.
+
+        Returns:
+            The reason, or None; and the time, s, until the next limit may be over, or None.
+        """
+        with self._changed:
+            now, silent = time.monotonic(), self.control.silent
+            waiting = {n: self._heard[n] + s - now for n, s in self._limits.items() if n not in silent}
+            name = min(waiting, key=lambda n: waiting[n]) if waiting else None
+            if name is None or waiting[name] > 0:
+                return None, None if name is None else waiting[name]
+            reason = f"{name}: silent for {now - self._heard[name]:.2f} s"
+            self.control.stop(reason, silent=name)
+            return reason, None
+
+    def bark(self, reason: str) -> None:
+        """Call `stop`; its error is kept."""
+        self.barks.append(reason)
+        try:
+            self._stop(reason)
+        except Exception as error:  # noqa: BLE001 - the next silence must stop the robot as well
+            self.error = error
+
     def _watch(self) -> None:
         me = threading.current_thread()
         while True:
@@ -258,17 +430,7 @@ class Watchdog:
                 while reason is None:
                     if self._thread is not me:
                         return
-                    now = time.monotonic()
-                    silent = self.control.silent
-                    waiting = {n: self._heard[n] + s - now for n, s in self._limits.items() if n not in silent}
-                    name = min(waiting, key=lambda n: waiting[n]) if waiting else None
-                    if name is not None and waiting[name] <= 0:
-                        reason = f"{name}: silent for {now - self._heard[name]:.2f} s"
-                        self.control.stop(reason, silent=name)
-                    else:
-                        self._changed.wait(None if name is None else waiting[name])
-            self.barks.append(reason)
-            try:
-                self._stop(reason)
-            except Exception as error:  # noqa: BLE001 - the next silence must stop the robot as well
-                self.error = error
+                    reason, wait_s = self.overdue()
+                    if reason is None:
+                        self._changed.wait(wait_s)
+            self.bark(reason)

@@ -214,6 +214,14 @@ def test_the_guard_sees_each_action(tmp_path: Path) -> None:
     assert np.abs(arm.observe().state["joints"]).max() < 1.0
 
 
+def test_a_trial_has_the_limits_of_the_plan(tmp_path: Path) -> None:
+    (tmp_path / "arm.json").write_text('{"low": -0.001, "high": 0.001}')
+    robot = {"limits": str(tmp_path / "arm.json")}
+    arm, config = Arm(), plan(tmp_path / "out", suite={"episodes": 1, "envs": ["drawer"]}, robot=robot)
+    evaluate_on_robot(config, ScriptedPerson(judged("f")), robot=arm, agent_factory=Policies())
+    assert np.abs(arm.observe().state["joints"]).max() <= 0.001
+
+
 @pytest.mark.parametrize("mode", ["async", "ensemble"])
 def test_it_plays_in_each_mode_of_the_chunk_player_and_closes_what_it_opened(tmp_path: Path, mode: str) -> None:
     closed: list[str] = []

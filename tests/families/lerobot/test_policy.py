@@ -88,6 +88,15 @@ def test_the_contract_is_what_the_checkpoint_was_trained_with(loaded: Load) -> N
     assert loaded("smolvla").contract.cameras == {tiny.CAMERA: CameraSpec()}  # it resizes any image itself
 
 
+def test_the_ranges_of_the_training_are_stated(loaded: Load) -> None:
+    stated, made = loaded("act").statistics, tiny.statistics()
+    assert stated is not None
+    assert stated["parts"] == ["joints"]
+    for key in ("observation.state", "action"):
+        assert set(stated[key]) == {"min", "max"}
+        np.testing.assert_allclose(stated[key]["min"], made[key]["min"], rtol=1e-6)
+
+
 def test_images_of_any_size_meet_in_a_batch_of_a_policy_that_resizes(loaded: Load) -> None:
     policy = loaded("smolvla")
     sides = [64, 96, 64]

@@ -370,6 +370,20 @@ def test_a_policy_for_another_robot_is_refused(tmp_path: Path, capsys: pytest.Ca
     assert "camera 'front': the policy needs it, the env gives ['top']" in capsys.readouterr().err
 
 
+def test_the_check_of_a_robot_behind_topics_moves_nothing(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("builtins.input", lambda _: "")  # the person cannot tell
+    with rosbridge_double() as double, RosArm(double.publish, lambda: double.on(COMMANDS)):
+        (tmp_path / "arm.yaml").write_text(yaml.safe_dump(ros_arm.settings(double.url)))
+        assert command.main(["check", "--ros", str(tmp_path / "arm.yaml"), "--hz", "20"]) == 0
+        assert len({tuple(one["data"]) for one in double.on(COMMANDS)}) <= 1, "stops, with the measured pose"
+    printed = capsys.readouterr().out
+    assert "ok observation" in printed
+    assert "not checked cameras" in printed
+    assert "not checked order" in printed
+
+
 def test_an_action_of_another_length_is_not_published() -> None:
     with rosbridge_double() as double, RosArm(double.publish, lambda: double.on(COMMANDS)):
         settings = settings_from(ros_arm.settings(double.url), "arm.yaml")

@@ -395,6 +395,18 @@ def test_what_is_loaded_is_told_by_its_digest_in_the_metadata_and_with_each_rese
             engine.close()
 
 
+def test_the_statistics_of_the_training_are_in_the_metadata_of_the_weights(tmp_path: Path) -> None:
+    (tmp_path / "weights.pt").write_bytes(b"1")
+    agent = Stored(tmp_path / "weights.pt", {"digest": "mine", "revision": None})
+    agent.statistics = {"action": {"min": [0.0], "max": [1.0]}}
+    engine = Engine(agent)
+    engine.start()
+    try:
+        assert engine.models.weights == {"digest": "mine", "revision": None, "statistics": agent.statistics}
+    finally:
+        engine.close()
+
+
 def test_sessions_move_between_replicas_with_the_same_weights_only(tmp_path: Path) -> None:
     """A replica that started after training had overwritten the checkpoint has others, by the same settings."""
     file = tmp_path / "weights.pt"

@@ -202,7 +202,7 @@ class RobotTask(_PlanModel):
 class RobotConfig(_PlanModel):
     """The robot of an evaluation, its control loop, and its tasks (see `vlagents_ray.evaluate.robot`)."""
 
-    arm: str | None = None  # "module:Class" of the robot; None: the plan is played in simulation
+    arm: str | None = None  # "module:Class" of the robot, or an arm by name; None: the plan is played in simulation
     tasks: dict[Name, RobotTask] = Field(min_length=1)
     # Draws the order of policies; None: a key is drawn, and kept in the folder of results.
     key: Annotated[str, Field(min_length=8)] | None = None
@@ -214,6 +214,7 @@ class RobotConfig(_PlanModel):
     safe: Literal["auto", "hold", "zero"] = "auto"
     max_step: PositiveFloat | None = None
     measure: str | None = None  # the part of the state that is the measured pose
+    limits: str | None = None  # a file of `Limits.read`, without the soft start
     silent_s: PositiveFloat = 2.0  # a server that is silent for longer ends the trial, which is repeated
 
 

@@ -40,7 +40,7 @@ from vlagents_ray.evaluate.robot.trial import PlayedTrial, Trial, WatchedRobot, 
 from vlagents_ray.evaluate.run import conclude
 from vlagents_ray.evaluate.workers.rollout import AgentFactory, agents
 from vlagents_ray.registry import require
-from vlagents_ray.robot.loop import ROBOT, Robot, import_class
+from vlagents_ray.robot.loop import Robot, robot_named
 
 LOG, KEY = "trials.jsonl", "trials.key"
 _NONCE = 16  # bytes
@@ -252,7 +252,7 @@ def evaluate_on_robot(
             require(module)
     factory = agent_factory or agents(config, None, "robot")
     if robot is None:
-        robot = import_class("--robot", str(planned[0].on_robot[0].arm), ROBOT)()
+        robot = robot_named("--robot", str(planned[0].on_robot[0].arm))()
     watched = WatchedRobot(robot)
     with TrialLog(config, planned) as log:
         trials = schedule(planned, log.key)

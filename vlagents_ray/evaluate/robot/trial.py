@@ -245,7 +245,14 @@ def _player(
                 max_age_s=settings.max_age_s,
                 safe=settings.safe,
             ),
-            check=Guard(agent.contract, max_step=settings.max_step, measure=measured_state(settings.measure)),
+            check=Guard(
+                agent.contract,
+                max_step=settings.max_step,
+                measure=measured_state(settings.measure),
+                limits=settings.limits,
+                hz=settings.hz,
+                soft_start_s=0.0,  # the same limits in each trial of each policy
+            ),
         )
         unplayed.pop_all()  # the player closes it
     with player:

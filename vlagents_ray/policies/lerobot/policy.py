@@ -21,7 +21,7 @@ from vlagents_ray.policies.base.staging import StagedRow
 from vlagents_ray.policies.flow import OFFERED
 from vlagents_ray.policies.lerobot import checkpoint, kinds
 from vlagents_ray.policies.lerobot.config import LeRobotConfig
-from vlagents_ray.policies.lerobot.processors import STATE, Processors, own_processors
+from vlagents_ray.policies.lerobot.processors import ACTION, STATE, Processors, own_processors
 from vlagents_ray.policies.outcomes import attempt
 from vlagents_ray.registry import require
 
@@ -108,7 +108,9 @@ class LeRobot(ModelPolicy):
             )
         self.config = _with_defaults(self.config, kind)
         processors = Processors(folder, settings, self.config, kind.staging)
-        return self._described(kind, processors, _trained(settings, processors), processors.rename_map)
+        loaded = self._described(kind, processors, _trained(settings, processors), processors.rename_map)
+        self.statistics = _ranges(loaded)
+        return loaded
 
     def _described(
         self, kind: kinds.Kind, processors: Processors, trained: DatasetContract, renames: dict[str, str]
@@ -220,6 +222,17 @@ def _with_defaults(config: LeRobotConfig, kind: kinds.Kind) -> LeRobotConfig:
             f"want at most these"
         )
     return config.model_copy(update={k: v for k, v in defaults.items() if k not in config.model_fields_set})
+
+
+def _ranges(loaded: LoadedLeRobot) -> dict[str, Any] | None:
+    """Return `Agent.statistics`: without turned angles of the state, and relative actions."""
+    found: dict[str, Any] = {}
+    for key, comparable in ((STATE, not loaded.trained.angles), (ACTION, not loaded.processors.whole)):
+        known = loaded.processors.statistics(key) if comparable else {}
+        for names in (("min", "max"), ("q01", "q99")):
+            if all(known.get(name) and np.isfinite(known[name]).all() for name in names):
+                found.setdefault(key, {name: known[name] for name in names})
+    return {"parts": loaded.state, **found} if found else None
 
 
 def _trained(settings: Any, processors: Processors) -> DatasetContract:

@@ -241,6 +241,8 @@ class Loader:
             files = files_named({**named, CHOICE: resolved(named)}, folders=not weights)
             if weights is None and files:
                 weights = {"digest": digest_of(files), "revision": None}
+            if weights is not None and agent.statistics is not None:
+                weights = {**weights, "statistics": agent.statistics}
             contract = agent.contract
             self._check(contract)
             copies = AgentCopies(agent)

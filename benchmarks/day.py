@@ -1,0 +1,508 @@
+"""A day of control without a jump: `python -m benchmarks.day --seed 1`, 24 simulated hours at 50 Hz with faults.
+
+Control loop, chunk player, guard, watchdog and command inbox are those of a robot; the arm, the network, the server,
+the operator and all clocks are simulated, so that a day takes minutes, and a seed replays exactly. Checked at each
+command:
+
+- no step above 3 times the largest one of a run without faults, also not from the measured pose after a stop;
+- no command after a stop or a pause until the operator at the robot has restarted it.
+
+Exit status: 0 without a violation, else 1. `--hours` and the seed repeat a violation, whose time the report has.
+
+`--ticks 20000` measures in place of a day what a tick costs: of the guard, and from `observe` until `apply` with and
+without it.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+import math
+import tempfile
+import time
+from collections import Counter
+from collections.abc import Iterator
+from dataclasses import asdict, dataclass, field, replace
+from pathlib import Path
+from typing import Annotated
+from unittest import mock
+
+import numpy as np
+import typer
+
+from benchmarks.console import Json, save
+from vlagents_ray.chunking import buffer, player
+from vlagents_ray.chunking.player import ChunkPlayer, PlayerSettings
+from vlagents_ray.cli.console import errors, out
+from vlagents_ray.client.commands import COMMAND, CommandInbox
+from vlagents_ray.contract import ActionSpec, Contract
+from vlagents_ray.errors import ConnectionLost, DeadlineExceeded, PolicyFailed, PolicyUnavailable, VLAgentsError
+from vlagents_ray.interface import CAPTURED, Act, Agent, Obs
+from vlagents_ray.robot import Guard, Limits, Watchdog, loop, run_loop, safety
+from vlagents_ray.robot.simulated import SimulatedRobot
+
+HZ = 50.0
+RUN_S = 3600.0  # a run of the control loop; the arm goes to its rest pose between two
+CHUNK = 50  # rows: 1 s
+INFERENCE_S = 0.03
+TIMEOUT_S = 10.0  # of a request
+FACTOR = 3.0  # a step above this multiple of the normal one is a jump
+_TURN = 2 * math.pi / (4 * HZ)  # of the path in a tick: one round takes 4 s
+_RADIUS = 0.5  # rad
+_SWAY = 0.0005  # rad, distance of the paths of two chunks
+_SMOOTHING = 0.5  # share of the distance to its target that a joint moves in a tick
+_LAG = 1.0  # ticks by which the joints are behind their targets, with that smoothing
+REST = (_RADIUS, 0.0, 0.3, 0.0, 0.0, 0.0, 1.0)
+LIMITS = Limits(velocity=2.0, acceleration=15.0, jerk=1000.0, rest=REST)
+FAULTS = {  # the mean duration of each, s; 0: a moment
+    "killed": 15.0,
+    "frozen": 5.0,
+    "far": 120.0,
+    "lossy": 60.0,
+    "cut": 10.0,
+    "old picture": 3.0,
+    "robot holds": 3.0,
+    "NaN": 1.0,
+    "wrong shape": 1.0,
+    "jump": 1.0,
+    "beyond limits": 1.0,
+    "policy error": 1.0,
+    "broken sensor": 1.0,
+    "guard error": 0.0,
+    "loop hangs": 0.0,
+    "clock step": 0.0,
+    "stop from afar": 0.0,
+    "pause from afar": 0.0,
+    "restart from afar": 0.0,
+    "pushed": 0.0,
+}
+_EVERY_S = 45.0  # mean time between two faults
+
+
+class DayClock:
+    """Stands for the module `time` in those that run; it goes on by ticks, and its wall time may be set."""
+
+    def __init__(self) -> None:
+        self.now, self.offset = 0.0, 1.7e9
+
+    def monotonic(self) -> float:
+        return self.now
+
+    def time(self) -> float:
+        return self.now + self.offset
+
+
+@dataclass(slots=True)
+class DayReport:
+    """The figures of a day."""
+
+    seed: int
+    hours: float
+    ticks: int = 0
+    commands: int = 0
+    moving_s: float = 0.0
+    runs: int = 0
+    failed_runs: int = 0  # that ended by an error
+    stops: int = 0
+    restarts: int = 0  # by the operator at the robot
+    normal_step: float = 0.0  # rad
+    largest_step: float = 0.0  # rad
+    faults: dict[str, int] = field(default_factory=dict)
+    held: dict[str, int] = field(default_factory=dict)  # ticks without the policy, by cause, in whole runs
+    violations: list[str] = field(default_factory=list)
+    digest: str = ""  # of all commands
+
+
+class World:
+    """The simulated arm, its surroundings and its operator; `robot` methods are those of `vlagents_ray.robot.Robot`."""
+
+    def __init__(self, seed: int, hours: float, *, faults: bool) -> None:
+        self.clock = DayClock()
+        self.report = DayReport(seed, hours)
+        self.random = np.random.default_rng(seed)
+        self.joints = np.array(REST, np.float32)
+        self.target = self.joints.copy()
+        self.commanded = self.joints.copy()  # the last command, or the pose at rest
+        self.holds: str | None = None
+        self.until: dict[str, float] = {}  # the end of each fault that lasts
+        self.forbidden: str | None = None  # the reason why nothing may be commanded
+        self.restart_at = math.inf
+        self.hang_s = 0.0
+        self.guard_fails = False
+        self._next_fault = self.random.exponential(_EVERY_S) if faults else math.inf
+        self._picture: Obs | None = None
+        self._sum = hashlib.sha256()
+        self.commands = CommandInbox()
+        self.watchdog = DayWatchdog(self._barked, {"server": 2.0, "loop": 0.25})
+        self.watchdog.clock = self.clock
+
+    def has(self, fault: str) -> bool:
+        """Return whether a fault lasts."""
+        return self.until.get(fault, 0.0) > self.clock.now
+
+    def observe(self) -> Obs:
+        """Return the joints, or the observation of before while the camera hangs."""
+        self.joints = self.joints + np.float32(_SMOOTHING) * (self.target - self.joints)
+        if self._picture is None or not self.has("old picture"):
+            self._picture = Obs(state={"joints": self.joints.copy()}, info={CAPTURED: self.clock.time()})
+        return self._picture
+
+    def apply(self, action: np.ndarray) -> None:
+        """Check and execute a command."""
+        report = self.report
+        step = float(np.abs(action - self.commanded).max())
+        report.commands += 1
+        report.moving_s += (step > 0) / HZ
+        report.largest_step = max(report.largest_step, step)
+        if report.normal_step and step > FACTOR * report.normal_step:
+            self.violated(f"a step of {step:.4f} rad")
+        if self.forbidden is not None:
+            self.violated(f"a command after: {self.forbidden}")
+        self._sum.update(action.tobytes())
+        self.target = self.commanded = action.copy()
+
+    def stop(self, reason: str = "") -> None:
+        """Make the present pose the target."""
+        self.target = self.commanded = self.joints.copy()
+
+    def violated(self, what: str) -> None:
+        """Record a violation."""
+        if len(self.report.violations) < 20:
+            lasting = [name for name, until in self.until.items() if until > self.clock.now]
+            self.report.violations.append(f"{self.clock.now:.2f} s: {what}; faults {lasting}")
+
+    def measured(self, obs: Obs) -> np.ndarray:
+        """Return the measured pose for the guard."""
+        return np.full(7, np.nan, np.float32) if self.has("broken sensor") else obs.state["joints"]
+
+    def advance(self, seconds: float) -> None:
+        """Let time pass: faults begin and end, the watchdog looks, and the operator comes."""
+        self.clock.now += seconds
+        if self.clock.now >= self._next_fault:
+            self._next_fault = self.clock.now + self.random.exponential(_EVERY_S)
+            self._begin(str(self.random.choice(list(FAULTS))))
+        self.holds = "the camera hangs" if self.has("robot holds") else None
+        while (reason := self.watchdog.overdue()[0]) is not None:
+            self.watchdog.bark(reason)
+        if self.clock.now >= self.restart_at:
+            self._come()
+
+    def finished(self) -> DayReport:
+        """Return the report at the end of the day."""
+        self.report.digest = self._sum.hexdigest()[:16]
+        return self.report
+
+    def _barked(self, reason: str) -> None:
+        self.stop()
+        self._forbid(reason)
+
+    def _forbid(self, reason: str) -> None:
+        self.forbidden = reason
+        self.report.stops += 1
+        self.restart_at = min(self.restart_at, self.clock.now + 3 + self.random.exponential(20.0))
+
+    def _come(self) -> None:
+        """Restart the robot as its operator."""
+        self.restart_at = math.inf
+        if self.watchdog.restart():
+            self.watchdog.control.resume()
+            self.forbidden = None
+            self.report.restarts += 1
+        else:
+            self.restart_at = self.clock.now + 5.0
+
+    def _begin(self, fault: str) -> None:
+        self.report.faults[fault] = self.report.faults.get(fault, 0) + 1
+        if FAULTS[fault]:
+            length = FAULTS[fault] if fault == "cut" else self.random.exponential(FAULTS[fault])
+            self.until[fault] = self.clock.now + length
+        elif fault == "guard error":
+            self.guard_fails = True
+        elif fault == "loop hangs":
+            self.hang_s = 0.5
+        elif fault == "clock step":
+            self.clock.offset += self.random.normal(0.0, 10.0)
+        elif fault == "pushed":  # only an arm without commands can be moved by hand
+            if self.forbidden is not None:
+                self.joints = self.joints + self.random.uniform(-0.2, 0.2, 7).astype(np.float32)
+                self.stop()
+        else:
+            do = fault.partition(" ")[0]
+            self.commands.came(Act(self.joints, info={COMMAND: {"id": str(self.clock.now), "do": do}}))
+            if do != "restart":
+                self._forbid(fault)
+
+
+class DayWatchdog(Watchdog):
+    """A watchdog without its thread: the world calls `overdue` and `bark`."""
+
+    clock: DayClock
+
+    def start(self) -> None:
+        for name in self._limits:
+            self._heard[name] = self.clock.now
+
+    def close(self) -> None:
+        pass
+
+
+class DayPolicy(Agent):
+    """A policy that leads the arm around a closed path from any pose, behind a network and a server with faults."""
+
+    contract = Contract(action=ActionSpec(dim=7, delta=False), chunk=CHUNK)
+
+    def __init__(self, world: World) -> None:
+        self.world = world
+        self._cold = True
+
+    def act(self, obs: Obs) -> Act:
+        """Wait for the answer."""
+        due, answer = self.answer(obs)
+        self.world.clock.now = max(self.world.clock.now, due)
+        if isinstance(answer, Exception):
+            raise answer
+        return answer
+
+    def answer(self, obs: Obs) -> tuple[float, Act | Exception]:
+        """Return the answer to a request that is sent now, and when it arrives, s."""
+        world, random = self.world, self.world.random
+        now = world.clock.now
+        if world.has("killed"):
+            self._cold = True
+            return now + 0.2, PolicyUnavailable("the server restarts")
+        delay_s = INFERENCE_S * random.uniform(0.9, 1.3) + (3.0 if self._cold else 0.0)
+        self._cold = False
+        if world.has("far"):
+            delay_s += 0.08 * random.uniform(0.9, 1.5)
+        if world.has("lossy") and random.random() < 0.05:
+            delay_s += random.uniform(0.2, 1.5)
+        due = max(now + delay_s, world.until.get("frozen", 0.0))
+        if world.has("cut"):
+            due = max(due, world.until["cut"])
+            if random.random() < 0.5:
+                return due, ConnectionLost("the connection was lost")
+        if due > now + TIMEOUT_S:
+            return now + TIMEOUT_S, DeadlineExceeded("no answer in time")
+        if world.has("policy error"):
+            return due, PolicyFailed("planted")
+        return due, Act(self._rows(obs.state["joints"]))
+
+    def _rows(self, joints: np.ndarray) -> np.ndarray:
+        world, random = self.world, self.world.random
+        begin = math.atan2(float(joints[1]), float(joints[0])) + _TURN * _LAG
+        angle = begin + _TURN * np.arange(1, CHUNK + 1)
+        radius, zeros = _RADIUS + random.uniform(-_SWAY, _SWAY), np.zeros(CHUNK)
+        columns = [radius * np.cos(angle), radius * np.sin(angle), 0.3 * np.cos(2 * angle), zeros, zeros, zeros]
+        rows = np.stack([*columns, (1 + np.cos(angle)) / 2], 1).astype(np.float32)
+        place = int(random.integers(CHUNK))
+        if world.has("NaN"):
+            rows[place, 2] = np.nan
+        if world.has("wrong shape"):
+            return rows[:, :6]
+        if world.has("jump"):
+            rows[place:, 3] += 0.5
+        if world.has("beyond limits"):
+            rows[place:, 0] = 9.0
+        return rows
+
+
+class DayCaller:
+    """Stands for `AsyncCaller`: an answer is taken when the simulated time has come."""
+
+    def __init__(self, agent: DayPolicy) -> None:
+        self._agent = agent
+        self._coming: tuple[float, Act | Exception] | None = None
+
+    @property
+    def idle(self) -> bool:
+        return self._coming is None
+
+    def ask(self, obs: Obs) -> None:
+        self._coming = self._agent.answer(obs)
+
+    def take(self, wait_s: float = 0.0) -> Act | Exception | None:
+        if self._coming is None or self._coming[0] > self._agent.world.clock.now:
+            return None
+        (_, answer), self._coming = self._coming, None
+        return answer
+
+    def settle(self) -> None:
+        self._coming = None
+
+    def close(self) -> None:
+        self._coming = None
+
+
+class DayGuard(Guard):
+    """A guard that fails once when the world plants it."""
+
+    world: World
+
+    def __call__(self, action: np.ndarray, last: np.ndarray | None = None) -> np.ndarray:
+        if self.world.guard_fails:
+            self.world.guard_fails = False
+            raise ZeroDivisionError("planted")
+        return super().__call__(action, last)
+
+
+@contextlib.contextmanager
+def simulated_time(world: World) -> Iterator[None]:
+    """Run the modules of the control loop in the world's time, within the context."""
+
+    class Pacer:
+        period_s = 1 / HZ
+
+        def __init__(self, hz: float) -> None:
+            self.missed, self.ticks, self.late_s = 0, 0, [0.0]
+
+        def wait(self) -> int:
+            world.advance(self.period_s + world.hang_s)
+            world.hang_s = 0.0
+            world.report.ticks += 1
+            self.ticks += 1
+            return self.ticks - 1
+
+        def forget(self, end: int) -> None:
+            self.ticks -= 1
+
+        def since_tick_s(self) -> float:
+            return 0.0
+
+    with contextlib.ExitStack() as stack:
+        for module in (loop, player, buffer, safety):
+            stack.enter_context(mock.patch.object(module, "time", world.clock))
+        stack.enter_context(mock.patch.object(loop, "Pacer", Pacer))
+        stack.enter_context(mock.patch.object(loop, "undisturbed", return_value=contextlib.nullcontext([])))
+        stack.enter_context(mock.patch.object(loop, "_COLLECT_S", math.inf))
+        stack.enter_context(mock.patch.object(player, "AsyncCaller", DayCaller))
+        yield
+
+
+def play_day(seed: int, hours: float, *, faults: bool = True, normal_step: float = 0.0) -> DayReport:
+    """Play a day.
+
+    Args:
+        seed: Draws the faults, the delays, and when the operator comes.
+        hours: Its length.
+        faults: Whether there are any.
+        normal_step: The largest step of a run without faults, rad; 0 checks no steps.
+
+    Returns:
+        The figures.
+    """
+    world = World(seed, hours, faults=faults)
+    world.report.normal_step = normal_step
+    held: Counter[str] = Counter()
+    guard = DayGuard(DayPolicy.contract, low=-3.0, high=3.0, measure=world.measured, limits=LIMITS, hz=HZ)
+    guard.world = world
+    settings = PlayerSettings(mode="async", safe="hold", max_age_s=2.0)
+    with simulated_time(world), ChunkPlayer(DayPolicy(world), settings, check=guard) as driver:
+        while world.clock.now < hours * 3600:
+            world.report.runs += 1
+            left_s = min(RUN_S, hours * 3600 - world.clock.now)
+            try:
+                done = run_loop(world, driver, hz=HZ, seconds=left_s, watchdog=world.watchdog, commands=world.commands)
+                held.update({str(cause): ticks for cause, ticks in done.safe.items()})
+                held.update({"waiting": done.waiting, "paused": done.paused})
+            except (VLAgentsError, ZeroDivisionError):  # the operator begins another run
+                world.report.failed_runs += 1
+                world.stop()
+                for _ in range(int(10 * HZ)):
+                    world.advance(1 / HZ)
+    world.report.held = dict(held)
+    return world.finished()
+
+
+class CirclePolicy(Agent):
+    """Moves all joints to and fro, from rest."""
+
+    contract: Contract | None = None
+
+    def __init__(self, joints: int) -> None:
+        self.contract = Contract(action=ActionSpec(dim=joints, delta=False), chunk=CHUNK)
+        self._joints, self._asked = joints, 0
+
+    def act(self, obs: Obs) -> Act:
+        rows = [self.row(self._asked * CHUNK + i) for i in range(CHUNK)]
+        self._asked += 1
+        return Act(np.stack(rows))
+
+    def row(self, tick: int) -> np.ndarray:
+        """Return the action of a tick, (D,) float32 rad."""
+        return np.full(self._joints, _RADIUS * (1 - math.cos(_TURN * tick)), np.float32)
+
+
+def limits_of(joints: int) -> Limits:
+    """Return limits of speed, acceleration, jerk and the workspace of an arm's tip behind its first seven joints."""
+    links = "".join(
+        f'<joint name="{i}" type="revolute"><parent link="{i}"/><child link="{i + 1}"/><origin xyz="0 0 0.15" '
+        f'rpy="{(-1) ** i * 1.57} 0 0"/><axis xyz="0 0 1"/><limit lower="-3" upper="3" velocity="2"/></joint>'
+        for i in range(joints)
+    )
+    with tempfile.TemporaryDirectory() as folder:
+        Path(folder, "arm.urdf").write_text(f"<robot name='arm'>{links}</robot>")
+        Path(folder, "arm.json").write_text('{"urdf": "arm.urdf", "tip": "7"}')
+        read = Limits.read(Path(folder, "arm.json"))
+    dynamics = replace(read, acceleration=LIMITS.acceleration, jerk=LIMITS.jerk)
+    return replace(dynamics, workspace_low=(-2.0, -2.0, -2.0), workspace_high=(2.0, 2.0, 2.0))
+
+
+def tick_us(joints: int, ticks: int, *, part: str) -> list[float]:
+    """Measure part of each tick, µs: "guard", or from `observe` until `apply`, "loop" or "loop without guard"."""
+    policy, took = CirclePolicy(joints), list[float]()
+    guard = None if part == "loop without guard" else Guard(policy.contract, limits=limits_of(joints), hz=HZ)
+    if part == "guard" and guard is not None:
+        last = guard(policy.row(0))
+        for tick in range(1, ticks):
+            action = policy.row(tick)
+            begun = time.perf_counter()
+            last = guard(action, last)
+            took.append(1e6 * (time.perf_counter() - begun))
+        return took
+    robot = SimulatedRobot(policy.contract)
+    with ChunkPlayer(policy, PlayerSettings(mode="open_loop", deadline_s=1.0), check=guard) as driver:
+        driver.initialize()
+        driver.reset(robot.observe())
+        for _ in range(ticks):
+            begun = time.perf_counter()
+            robot.apply(driver.act(robot.observe()).action)
+            took.append(1e6 * (time.perf_counter() - begun))
+    return took
+
+
+def measure_ticks(ticks: int) -> dict[str, dict[str, float]]:
+    """Return median and 99 % quantile of each part of a tick, µs."""
+    found = {}
+    for joints in (7, 14):
+        for part in ("guard", "loop", "loop without guard"):
+            tick_us(joints, ticks // 10, part=part)  # warm
+            p50, p99 = np.quantile(tick_us(joints, ticks, part=part), [0.5, 0.99])
+            found[f"{part}, {joints} joints"] = {"p50_us": round(float(p50), 1), "p99_us": round(float(p99), 1)}
+    return found
+
+
+def main(
+    seed: int = 0,
+    hours: Annotated[float, typer.Option(help="of simulated time")] = 24.0,
+    ticks: Annotated[int, typer.Option(help="measure the cost of so many ticks, and play no day")] = 0,
+    json: Json = None,
+) -> None:
+    """Play a day with faults, and compare its steps with those of ten minutes without."""
+    if ticks:
+        measured = measure_ticks(ticks)
+        save({"ticks": measured}, json)
+        for name, figures in measured.items():
+            out.print(f"{name}: {figures}")
+        return
+    with errors():
+        normal = play_day(seed, 1 / 6, faults=False).largest_step
+        report = play_day(seed, hours, normal_step=normal)
+    save({"day": asdict(report)}, json)
+    for name, value in asdict(report).items():
+        out.print(f"{name}: {value}")
+    if report.violations:
+        raise typer.Exit(1)
+
+
+if __name__ == "__main__":
+    typer.run(main)

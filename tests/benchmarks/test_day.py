@@ -1,0 +1,49 @@
+"""Some minutes of the simulated day: what its checks find, and that a seed replays."""
+
+from __future__ import annotations
+
+import pytest
+
+from benchmarks import day
+from vlagents_ray.robot import Limits
+
+MINUTES = 1 / 60
+
+
+def test_minutes_with_faults_have_no_jump_and_no_command_after_a_stop() -> None:
+    normal = day.play_day(0, 2 * MINUTES, faults=False)
+    assert normal.stops == 0
+    assert normal.moving_s > 100  # of 120
+    report = day.play_day(3, 20 * MINUTES, normal_step=normal.largest_step)
+    assert report.violations == []
+    assert report.stops > 3
+    assert report.restarts > 0
+    assert report.moving_s > 400
+    assert len(report.faults) > 10
+
+
+def test_a_seed_replays_each_command() -> None:
+    first, again, other = (day.play_day(seed, 3 * MINUTES) for seed in (1, 1, 2))
+    assert first == again
+    assert first.digest != other.digest
+
+
+def test_a_guard_without_limits_lets_jumps_through_which_the_day_finds(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(day, "LIMITS", Limits())
+    report = day.play_day(3, 20 * MINUTES, normal_step=0.02)
+    assert any("a step of" in one for one in report.violations)
+
+
+def test_a_restart_from_afar_would_be_found(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The world's own check: a watchdog that restarts by itself commands without an operator."""
+    monkeypatch.setattr(day.DayWatchdog, "overdue", lambda self: (self.restart() and None, None))
+    report = day.play_day(3, 20 * MINUTES, normal_step=0.02)
+    assert any("a command after: stop from afar" in one for one in report.violations)
+
+
+def test_the_cost_of_a_tick_is_measured_with_and_without_the_guard() -> None:
+    measured = day.measure_ticks(200)
+    assert list(measured) == [
+        f"{part}, {joints} joints" for joints in (7, 14) for part in ("guard", "loop", "loop without guard")
+    ]
+    assert all(0 < figures["p50_us"] <= figures["p99_us"] for figures in measured.values())

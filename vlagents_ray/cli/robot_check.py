@@ -1,0 +1,81 @@
+"""Check a robot before a policy moves it: readings, pictures and `stop` at rest, then small moves, joint by joint.
+
+Nothing moves without --move, and then each motion only after a person at the robot has agreed. A simulated arm,
+"mujoco:ARM", is checked without a person.
+
+Exit status: 0 if no check found anything, 1 if one did, 2 if it could not run.
+"""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import sys
+import time
+from collections.abc import Sequence
+
+from vlagents_ray.client.agent import RemoteAgent
+from vlagents_ray.errors import VLAgentsError
+from vlagents_ray.robot.check import Operator, RobotReport, examine
+from vlagents_ray.robot.loop import Robot, robot_named
+from vlagents_ray.robot.mujoco_arm import SimulatedClock
+from vlagents_ray.robot.ros import RosRobot, read_settings
+
+
+def main(arguments: Sequence[str]) -> int:
+    """Run the command, and return its exit status."""
+    parser = command_parser()
+    options = parser.parse_args(arguments)
+    if (options.robot is None) == (options.ros is None):
+        parser.error("want a robot by name, or one behind topics of ROS 2 (--ros FILE)")
+    try:
+        with contextlib.ExitStack() as stack:
+            report = _checked(options, stack)
+    except VLAgentsError as error:
+        print(f"{type(error).__name__}: {error}", file=sys.stderr)  # noqa: T201
+        return 2
+    print("\n".join(report.lines()))  # noqa: T201
+    if options.report:
+        report.write(options.report)
+        print(f"report: {options.report}")  # noqa: T201
+    return 0 if report.ok else 1
+
+
+def _checked(options: argparse.Namespace, stack: contextlib.ExitStack) -> RobotReport:
+    robot: Robot
+    if options.ros is not None:
+        robot = stack.enter_context(RosRobot(read_settings(options.ros)))
+    else:
+        make = robot_named("robot", options.robot, options.robot_set)
+        robot = make(clock=SimulatedClock()) if options.robot.startswith("mujoco:") else make()
+        stack.callback(getattr(robot, "close", lambda: None))
+    contract = None
+    if options.policy is not None:
+        with RemoteAgent(options.policy) as agent:
+            contract = agent.contract
+    return examine(
+        robot,
+        contract=contract,
+        operator=getattr(robot, "operator", None) or Operator(move=options.move),
+        hz=options.hz,
+        latency_s=options.latency_ms / 1e3,
+        clock=getattr(robot, "clock", time),
+    )
+
+
+def command_parser() -> argparse.ArgumentParser:
+    """Return the parser of the command."""
+    parser = argparse.ArgumentParser(
+        prog="vlagents-ray robot check", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    add = parser.add_argument
+    names = "my_arm:MyArm, lerobot:so101_follower, mujoco:so101, or mujoco:PATH of an MJCF or URDF file"
+    add("robot", nargs="?", help=names)
+    add("--ros", metavar="FILE", help="check a robot behind topics of ROS 2, from this file; see docs/ros.md")
+    add("--robot-set", metavar="KEY=VALUE", action="append", default=[], help="an argument of the robot, repeatable")
+    add("--move", action="store_true", help="make small moves, each after a question at the terminal")
+    add("--policy", metavar="URL", help="check by the contract of the policy of this server, not by the robot's own")
+    add("--hz", type=float, help="control rate (default: the contract's, or 50)")
+    add("--latency-ms", type=float, default=400.0, help="longest time from command to motion (%(default)s)")
+    add("--report", metavar="FILE", help="write the report with pictures as an HTML page")
+    return parser

@@ -1,0 +1,650 @@
+"""A conformance suite for `observe`, `apply` and `stop` of a robot: what to know of an arm before a policy moves it."""
+
+from __future__ import annotations
+
+import base64
+import html
+import time
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from vlagents_ray.contract import ActionSpec, Contract, StateSpec
+from vlagents_ray.errors import ConfigError, InvalidObservation
+from vlagents_ray.images.jpeg_png import encode_jpeg
+from vlagents_ray.interface import CAPTURED, Obs
+from vlagents_ray.robot.loop import Robot
+from vlagents_ray.validation import check_observation
+
+CHECKS = {  # in the order in which they run
+    "observation": "observations fit the contract",
+    "clock": "time stamps are of now and do not go back",
+    "rate": "observe returns within a part of a tick, and gives new readings at the control rate",
+    "units": "joints are in the unit of the contract, positions in m, openings in [0, 1], quaternions of length 1",
+    "limits": "the arm is within its limits",
+    "stop": "stop returns at once, twice and from another thread, and ends a motion",
+    "cameras": "names, colours and orientation of the cameras are right, and no picture is frozen",
+    "place": "the hand is where its pose says",
+    "blocking": "apply does not wait for the motion",
+    "meaning": "the command of the present pose moves nothing: targets are absolute, as the contract states, or deltas",
+    "order": "each number of an action moves its own joint, and it alone",
+    "sign": "each joint moves to the side of its command",
+    "size": "each joint moves as far as its command",
+    "latency": "a motion is measured soon after its command",
+    "pose": "the pose of the hand turns and moves about the axis of each joint",
+    "commands": "each single command is executed",
+    "gripper": "the gripper closes when it is told to close",
+}
+_STEPS = {"rad": 0.05, "deg": 3.0, "m": 0.01}  # size of a small move by the unit of the joints
+_OTHER_STEP = 3.0  # of LeRobot's units, per cent of the range
+_RAMP_S = 0.4  # time of a small move
+_HOLD_S = 1.0  # time after it in which it must be measured
+_RUNAWAY = 3  # small moves; an arm that is farther from where it should be is stopped at once
+_STOP_S = 0.1  # longest call of `stop`
+_SKEW_S = (-1.0, 0.1)  # age of an observation's time stamp: as SKEW_S of the chunk player, s
+_MOST_M = 5.0  # an arm with a longer reach gives millimetres
+_RED = 40  # of 255, by which red has to exceed green and blue where the card is
+
+
+class Operator:
+    """The person at the robot, who is asked at the terminal; a subclass answers otherwise.
+
+    An answer None means that they cannot tell: the check is listed as not made. Without `move` they agree to no motion.
+    """
+
+    def __init__(self, *, move: bool = True) -> None:
+        self._move = move
+
+    def agrees(self, motion: str) -> bool:
+        """Return whether the robot may make this motion now."""
+        return self._move and _asked(f"The robot will do this: {motion}. Is its space free?") is True
+
+    def holds_card(self, camera: str | None) -> bool:
+        """Hold something red in the upper left quarter of what a camera sees; None: take it away. False: no card."""
+        where = f"Hold something red in the upper left quarter of what camera {camera!r} sees"
+        return _asked(f"{'Take the card away' if camera is None else where}. Done?") is True
+
+    def saw_joint(self, name: str, side: int) -> bool | None:
+        """Return whether this joint alone has moved since `agrees`, towards its positive (1) or negative (-1) side."""
+        return _asked(f"Did {name} alone move, to the side that its manual calls {'+' if side > 0 else '-'}?")
+
+    def saw_closing(self) -> bool | None:
+        """Return whether the gripper is closed now."""
+        return _asked("Is the gripper closed?")
+
+    def sees_hand(self, pose: np.ndarray, arm: int = 0) -> bool | None:
+        """Return whether an arm's hand is at a pose, (7,): m from its base, x forwards, z up, and quaternion xyzw."""
+        x, y, z, *quaternion = np.round(pose, 2).tolist()
+        place = f"{x} m in front of the base, {y} m to its left, {z} m above it, with the quaternion xyzw {quaternion}"
+        return _asked(f"Is the hand of arm {arm + 1} there: {place}?")
+
+
+def _asked(question: str) -> bool | None:
+    try:
+        answer = input(f"{question} [y/n, Enter: cannot tell] ").strip().lower()
+    except EOFError:
+        return None
+    return {"y": True, "n": False}.get(answer[:1])
+
+
+@dataclass(frozen=True)
+class Finding:
+    """A violation: what was measured, what is right, and what to change."""
+
+    check: str  # a key of CHECKS
+    got: str
+    want: str
+    cure: str
+    when: str  # "before any motion", or the motion at which it was found
+
+    def __str__(self) -> str:
+        return f"{self.check}: got {self.got}, want {self.want}; {self.cure} (found {self.when})"
+
+
+@dataclass
+class RobotReport:
+    """The outcome of a check of a robot."""
+
+    findings: list[Finding] = field(default_factory=list)
+    passed: list[str] = field(default_factory=list)  # keys of CHECKS
+    skipped: dict[str, str] = field(default_factory=dict)  # check: the reason
+    figures: dict[str, float] = field(default_factory=dict)  # measured, with the unit in the name
+    pictures: dict[str, np.ndarray] = field(default_factory=dict)  # (H, W, 3) uint8 by title
+
+    @property
+    def ok(self) -> bool:
+        """Whether no check found a violation."""
+        return not self.findings
+
+    def lines(self) -> list[str]:
+        """Return the report as lines of text."""
+        return [
+            *(f"FOUND {finding}" for finding in self.findings),
+            *(f"ok {name}: {CHECKS[name]}" for name in self.passed),
+            *(f"not checked {name}: {reason}" for name, reason in self.skipped.items()),
+            *(f"{name}: {value:.3g}" for name, value in self.figures.items()),
+        ]
+
+    def write(self, file: str | Path) -> None:
+        """Write the report with its pictures as one HTML page, which needs no network."""
+        lines = "".join(f"<li>{html.escape(line)}</li>" for line in self.lines())
+        pictures = "".join(
+            f'<figure><img src="data:image/jpeg;base64,{base64.b64encode(encode_jpeg(picture)).decode()}">'
+            f"<figcaption>{html.escape(title)}</figcaption></figure>"
+            for title, picture in self.pictures.items()
+        )
+        style = "body{font-family:sans-serif}figure{display:inline-block;margin:8px}img{height:240px}"
+        page = f"<!doctype html><meta charset=utf-8><title>Check of a robot</title><style>{style}</style>"
+        Path(file).write_text(f"{page}<h1>Check of a robot</h1><ul>{lines}</ul>{pictures}", encoding="utf-8")
+
+
+def examine(
+    robot: Robot,
+    *,
+    contract: Contract | None = None,
+    operator: Operator | None = None,
+    hz: float | None = None,
+    latency_s: float = 0.4,
+    clock: Any = time,
+) -> RobotReport:
+    """Check a robot, first at rest, then by small moves of one joint at a time to which the operator agrees.
+
+    A finding at rest prevents all motion, one in motion stops the robot and ends the check.
+
+    Args:
+        robot: The robot, at rest and away from the limits of its joints.
+        contract: What the robot provides and accepts; by default its own. Moves need `action.dim`, and whether actions
+            are relative.
+        operator: The person at the robot; None: nothing moves.
+        hz: The control rate, Hz; by default the contract's, else 50.
+        latency_s: The longest time from a command to its measured motion, s.
+        clock: The module `time`, or the `SimulatedClock` of a simulated robot.
+
+    Returns:
+        The findings, and which checks passed or were not made.
+    """
+    contract = contract or getattr(robot, "contract", None) or Contract()
+    suite = _Suite(robot, contract, operator, 1 / (hz or contract.control_hz or 50.0), latency_s, clock)
+    try:
+        suite.at_rest()
+        suite.in_motion()
+    except _FoundInMotionError:
+        pass
+    except InvalidObservation as error:
+        suite.find("observation", str(error), "an observation that fits the contract", "correct observe", ends=False)
+    finally:
+        robot.stop()
+    found = {finding.check for finding in suite.report.findings}
+    suite.skip_others("an earlier check found something" if found else "nothing moved")
+    return suite.report
+
+
+class _FoundInMotionError(Exception):
+    """Ends the check, as a finding in motion was reported."""
+
+
+@dataclass
+class _Suite:
+    _robot: Robot
+    _contract: Contract
+    _operator: Operator | None
+    _period_s: float
+    _latency_s: float
+    _clock: Any
+    report: RobotReport = field(default_factory=RobotReport)
+    _when: str = ""  # the present motion; empty at rest
+    _stamp_s: float = -np.inf
+    _stamped: bool = True  # time stamps were right so far
+    _observe_s: list[float] = field(default_factory=list)
+    _apply_s: list[float] = field(default_factory=list)
+    _lags_s: list[float] = field(default_factory=list)
+    _command: np.ndarray = field(default_factory=lambda: np.zeros(0))  # the last action
+    _layout: _Layout | None = None
+
+    def find(self, check: str, got: str, want: str, cure: str, *, ends: bool = True) -> None:
+        """Report a finding; one in motion stops the robot and ends the check."""
+        when = f"during {self._when}" if self._when else "before any motion"
+        self.report.findings.append(Finding(check, got, want, cure, when))
+        if ends and self._when:
+            self._robot.stop()
+            raise _FoundInMotionError
+
+    def at_rest(self) -> None:
+        """Run the checks that move nothing."""
+        first = self._observe()
+        self._layout = _Layout.find(self._robot, self._contract, first)
+        check_observation(first, self._contract)
+        self._passes("observation")
+        for _ in range(20):
+            self._clock.sleep(self._period_s)
+            last = self._observe()
+        if self._stamped:
+            self._passes("clock")
+        median_ms, most_ms = (1e3 * float(np.quantile(self._observe_s, q)) for q in (0.5, 0.99))
+        self.report.figures |= {"observe p50, ms": median_ms, "observe p99, ms": most_ms}
+        if median_ms > 500 * self._period_s:
+            limit = f"at most {500 * self._period_s:.3g} ms, half of a tick"
+            self.find("rate", f"{median_ms:.3g} ms for observe", limit, "read cameras and bus in threads of their own")
+        self._check_units(last)
+        self._check_limits(last)
+        self._check_stop()
+        self._check_cameras()
+        self._check_place(last)
+
+    def in_motion(self) -> None:
+        """Move one joint at a time, then the grippers, unless there is a finding or a reason against it."""
+        layout = self._layout
+        if self.report.findings:
+            return
+        if layout is None or self._contract.action.relative is None:
+            self.skip_others("the contract states no joint targets or deltas (action.dim, space, delta), or no state")
+            return
+        if not self._agreed("the command of the present pose, at which nothing should move"):
+            return
+        self._check_meaning(layout)
+        self._passes("meaning", "blocking")
+        for joint, name in enumerate(layout.names):
+            if not self._agreed(f"a move of {name} by {layout.step:g} {layout.unit} and back"):
+                return
+            self._move(layout, joint, name)
+            if joint == 0:
+                self._check_single_commands(layout, name)
+                self._check_stop_in_motion(layout, name)
+        self._passes("order", "sign", "size", "latency", "rate", "pose", "commands", "stop")
+        self.report.figures["command to measured motion, ms"] = 1e3 * float(np.median(self._lags_s))
+        self._check_grippers(layout)
+
+    def skip_others(self, reason: str) -> None:
+        """List the checks without a result as not made."""
+        done = {*self.report.passed, *(finding.check for finding in self.report.findings)}
+        for name in CHECKS:
+            if name not in done:
+                self.report.skipped.setdefault(name, reason)
+
+    def _agreed(self, motion: str) -> bool:
+        self._when = ""
+        if self._operator is None:
+            self.skip_others("no operator agreed to a motion")
+        elif self._operator.agrees(motion):
+            self._when = motion
+        else:
+            self.skip_others(f"the operator did not agree to {motion}")
+        return bool(self._when)
+
+    def _passes(self, *checks: str) -> None:
+        found = {finding.check for finding in self.report.findings} | self.report.skipped.keys()
+        self.report.passed += [one for one in checks if one not in found and one not in self.report.passed]
+
+    def _observe(self) -> Obs:
+        began_s = self._clock.monotonic()
+        obs = self._robot.observe()
+        self._observe_s.append(self._clock.monotonic() - began_s)
+        stamp_s = obs.info.get(CAPTURED)
+        if stamp_s is None:
+            self.report.skipped.setdefault("clock", f"observations have no {CAPTURED!r}")
+        elif self._stamped:
+            ahead_s = stamp_s - self._clock.time()
+            back_s, self._stamp_s = self._stamp_s - stamp_s, stamp_s
+            if back_s > 0 or not _SKEW_S[0] <= ahead_s <= _SKEW_S[1]:
+                self._stamped = False
+                got = f"a time stamp {back_s:.3g} s before the last one" if back_s > 0 else f"one {ahead_s:+.3g} s off"
+                cure = "use time.time() of this machine when the first sensor is read, or synchronize the clocks"
+                self.find("clock", got, "the time at which the first sensor was read", cure)
+        return obs
+
+    def _apply(self, action: np.ndarray) -> None:
+        self._command = action
+        began_s = self._clock.monotonic()
+        self._robot.apply(action.astype(np.float32))
+        took_s = self._clock.monotonic() - began_s
+        self._apply_s.append(took_s)
+        if np.median(self._apply_s) > max(0.005, self._period_s / 4):
+            limit = f"at most {1e3 * max(0.005, self._period_s / 4):.3g} ms"
+            cure = "send the command and return; do not wait until the arm is there"
+            self.find("blocking", f"{1e3 * took_s:.3g} ms for apply", limit, cure)
+
+    def _check_units(self, obs: Obs) -> None:
+        for name, part in obs.state.items():
+            spec = (self._contract.state or {}).get(name)
+            unit, kind = spec.unit if spec else None, name.rpartition("/")[2]
+            if kind == "joints" and unit in (None, "rad") and np.abs(part).max() > 2.1 * np.pi:
+                got = f"{np.abs(part).max():.4g} in {name!r}, more than a full turn"
+                self.find("units", got, "rad", "convert degrees by np.deg2rad, in observe and in apply")
+            if kind in ("tquat", "xyzrpy") and np.abs(part[:3]).max() > _MOST_M:
+                self.find("units", f"{np.abs(part[:3]).max():.4g} in {name!r}", "m", "divide millimetres by 1000")
+            if kind == "tquat" and abs(np.linalg.norm(part[3:]) - 1) > 0.01:
+                got = f"a quaternion of length {np.linalg.norm(part[3:]):.3g} in {name!r}"
+                self.find("units", got, "1", "give position and then quaternion xyzw")
+        if obs.gripper is not None and not 0 <= obs.gripper <= 1:
+            self.find("units", f"a gripper of {obs.gripper:.3g}", "[0, 1], 1 = open", "scale it by its closed and open")
+        self._passes("units")
+
+    def _check_limits(self, obs: Obs) -> None:
+        layout = self._layout
+        if any(finding.check == "units" for finding in self.report.findings):
+            return
+        if layout is None or np.isinf(layout.limits).all():
+            self.report.skipped["limits"] = "the robot has no `joint_limits`, or no state of its joints"
+            return
+        for name, measured, (low, high) in zip(layout.names, layout.measured(obs), layout.limits, strict=True):
+            if not low <= measured <= high:
+                got, want = f"{name} at {measured:.4g}", f"[{low:.4g}, {high:.4g}]"
+                self.find("limits", got, want, "give the limits of this arm, in the order and unit of its joints")
+                break
+        self._passes("limits")
+
+    def _check_stop(self) -> None:
+        def in_thread() -> None:
+            with ThreadPoolExecutor(1) as thread:
+                thread.submit(self._robot.stop).result()
+
+        for place, call in (("", self._robot.stop), (" again", self._robot.stop), (" from a thread", in_thread)):
+            began_s = self._clock.monotonic()
+            try:
+                call()
+            except Exception as error:  # noqa: BLE001 - any error of the robot is a finding
+                self.find("stop", f"{error!r} from stop{place}", "no error in any state", "make stop safe to repeat")
+                return
+            if (took_s := self._clock.monotonic() - began_s) > _STOP_S:
+                self.find("stop", f"{took_s:.3g} s for stop{place}", f"at most {_STOP_S} s", "send it and return")
+                return
+
+    def _check_cameras(self) -> None:
+        before = self._observe().cameras
+        self.report.pictures |= before
+        for camera in before:
+            if self._operator is None or not self._operator.holds_card(camera):
+                self.report.skipped["cameras"] = "nobody could hold the red card"
+                return
+            self._clock.sleep(0.3)
+            seen = self._observe().cameras
+            self.report.pictures[f"{camera}, with the red card in the upper left"] = seen[camera]
+            self._judge_card(camera, {name: _card(before[name], seen[name]) for name in before})
+        if not before:
+            self.report.skipped["cameras"] = "there is none"
+        elif self._operator is not None:
+            self._operator.holds_card(None)
+        self._passes("cameras")
+
+    def _judge_card(self, camera: str, found: dict[str, _Card | None]) -> None:
+        card, want = found[camera], f"the card, red, in the upper left of {camera!r}"
+        others = [name for name, other in found.items() if name != camera and other is not None and other.share > 0.004]
+        if card is None and others:
+            self.find("cameras", f"the card of {camera!r} in {others[0]!r}", want, "exchange the names of the cameras")
+        elif card is None:
+            cure = "the camera hangs or gives old pictures; restart it, and read each frame once"
+            self.find("cameras", f"no change in {camera!r}, a frozen picture", want, cure)
+        elif not card.red:
+            self.find("cameras", f"a blue card in {camera!r}", want, "give RGB: image[..., ::-1] of OpenCV's BGR")
+        elif card.x > 0.5 or card.y > 0.5:
+            side = f"the card at {100 * card.x:.0f} % from the left and {100 * card.y:.0f} % from the top of {camera!r}"
+            self.find("cameras", side, want, "rotate or flip the picture in observe: it must be upright, not mirrored")
+
+    def _check_place(self, obs: Obs) -> None:
+        for number, arm in enumerate(self._contract.action.arms or ("",)):
+            pose = obs.state.get(arm_part(arm, "tquat"))
+            sees = None if pose is None or self._operator is None else self._operator.sees_hand(pose, number)
+            if pose is None or sees is None:
+                self.report.skipped["place"] = "observations have no 'tquat', or the operator cannot tell"
+            elif not sees and not self.report.findings:
+                got = f"the hand at {np.round(pose[:3], 2)} m with the quaternion {np.round(pose[3:], 2)}, as it is not"
+                cure = "give the pose in the frame of the arm's base, x forwards and z up, and the quaternion as xyzw"
+                self.find("place", got, "the pose that the operator sees", cure)
+        self._passes("place")
+
+    def _hold_command(self, layout: _Layout, obs: Obs) -> np.ndarray:
+        """Return the action that should move nothing."""
+        action = np.zeros(layout.dim)
+        if not layout.relative:
+            action[layout.joints] = layout.measured(obs)
+        spec = self._contract.action
+        if layout.grippers and spec.gripper_open is not None and spec.gripper_closed is not None:
+            opening = 1.0 if obs.gripper is None else obs.gripper
+            action[layout.grippers] = spec.gripper_closed + opening * (spec.gripper_open - spec.gripper_closed)
+        return action
+
+    def _check_meaning(self, layout: _Layout) -> None:
+        obs = self._observe()
+        start = layout.measured(obs)
+        self._apply(self._hold_command(layout, obs))
+        for _ in range(round((0.5 + self._latency_s) / 0.01)):
+            self._clock.sleep(0.01)
+            moved = layout.measured(self._observe()) - start
+            if np.abs(moved).max() > _RUNAWAY * layout.step:
+                most = int(np.argmax(np.abs(moved)))
+                got = f"a motion of {layout.names[most]} by {moved[most]:+.3g} and more"
+                kind = "absolute targets" if layout.relative else "deltas"
+                cure = f"the arm takes {kind}, or other units: correct apply, or action.delta of the contract"
+                self.find("meaning", got, "none at the command of the present pose", cure)
+
+    def _ramp(self, layout: _Layout, joint: int, change: float) -> list[tuple[float, np.ndarray]]:
+        """Move a joint by `change`; return times and measured joints during the move and until it is over."""
+        base = layout.measured(self._observe())
+        ticks = max(1, round(_RAMP_S / self._period_s))
+        seen = []
+        for tick in range(1, ticks + round(_HOLD_S / self._period_s) + 1):
+            if tick <= ticks:
+                self._apply(layout.changed(self._command, joint, change / ticks))
+            self._clock.sleep(self._period_s)
+            measured = layout.measured(self._observe())
+            seen.append((self._clock.monotonic(), measured))
+            if np.abs(measured - base).max() > _RUNAWAY * layout.step:
+                self._judge_move(layout, joint, change, measured - base)
+        return seen
+
+    def _move(self, layout: _Layout, joint: int, name: str) -> None:
+        before = self._observe()
+        base, began_s = layout.measured(before), self._clock.monotonic()
+        room = base[joint] + 2 * layout.step < layout.limits[joint][1]
+        change = layout.step if room else -layout.step
+        seen = self._ramp(layout, joint, change)
+        after = self._observe()
+        moved = layout.measured(after) - base
+        self._judge_move(layout, joint, change, moved)
+        saw = self._operator.saw_joint(name, 1 if room else -1) if self._operator is not None else None
+        if saw is None:
+            reason = f"command and reading agree, but the operator could not tell whether {name} moved"
+            self.report.skipped |= {"order": reason, "sign": reason}
+        if saw is False:
+            cure = "correct the order or the sign of the joints, in observe and in apply"
+            got = f"another joint, or another side, when {name} was commanded"
+            self.find("order", got, f"{name} alone, {change:+g}", cure)
+        half = [at for at, measured in seen if (measured[joint] - base[joint]) / change >= 0.5]
+        self._lags_s.append((half[0] if half else np.inf) - began_s - _RAMP_S / 2)
+        if self._lags_s[-1] > self._latency_s:
+            got = f"{self._lags_s[-1]:.3g} s from the command of {name} to its measured motion"
+            cure = "read the newest state, without a queue; if the arm itself is slow, give latency_s"
+            self.find("latency", got, f"at most {self._latency_s} s", cure)
+        values = [measured[joint] for _, measured in seen]
+        ticks = round(_RAMP_S / self._period_s)
+        fresh = int(np.count_nonzero(np.abs(np.diff(values)) > 1e-3 * layout.step))
+        if fresh < ticks / 2:
+            got = f"{fresh} new readings of {name} in a move of {ticks} ticks"
+            cure = "run the arm's own loop, and read it, at the control rate, or lower the rate (hz)"
+            self.find("rate", got, f"one a tick, {1 / self._period_s:.3g} Hz", cure)
+        self._judge_pose(layout, joint, before, after)
+        self._ramp(layout, joint, -change)
+        left = layout.measured(self._observe()) - base
+        if np.abs(left).max() > layout.step / 2:
+            got = f"{np.abs(left).max():.3g} off after the way back of {name}"
+            self.find("size", got, "the pose before", "check the arm's controller")
+
+    def _judge_move(self, layout: _Layout, joint: int, change: float, moved: np.ndarray) -> None:
+        """Compare the measured changes of all joints, (D,), with the commanded change of one."""
+        most, name, ratio = int(np.argmax(np.abs(moved))), layout.names[joint], float(moved[joint] / change)
+        if np.abs(moved).max() < 0.3 * layout.step:
+            cure = "check that torque is on, and that apply sends each command"
+            self.find("size", f"no motion of any joint for {name}", f"{change:+g}", cure)
+        elif most != joint:
+            got = f"{layout.names[most]} moved by {moved[most]:+.3g} when {name} was commanded"
+            self.find("order", got, f"{name} alone", "give actions and state the same order of joints")
+        elif ratio < 0:
+            got = f"{name} moved by {moved[joint]:+.3g} for {change:+g}"
+            self.find("sign", got, "the same sign", "invert the joint in observe or in apply, as the policy's data do")
+        elif not 0.5 < ratio < 1.5:
+            got = f"{name} moved by {moved[joint]:+.3g} for {change:+g}"
+            cure = "check the units of both, and that each command is executed once"
+            self.find("size", got, f"{change:+g}", cure)
+
+    def _judge_pose(self, layout: _Layout, joint: int, before: Obs, after: Obs) -> None:
+        """Check that the pose turned by the joint's angle and moved about the same axis, as one joint moves a hand."""
+        key = layout.pose_of[joint]
+        if key is None or layout.unit not in ("rad", "deg"):
+            self.report.skipped["pose"] = "observations have no 'tquat', the pose of the hand"
+            return
+        (p0, q0), (p1, q1) = ((obs.state[key][:3], obs.state[key][3:].astype(float)) for obs in (before, after))
+        turned = _times(q1, q0 * [-1, -1, -1, 1])
+        sine = np.linalg.norm(turned[:3])
+        angle = 2 * np.arctan2(sine, abs(turned[3]))
+        change = abs(layout.measured(after)[joint] - layout.measured(before)[joint])
+        change = np.deg2rad(change) if layout.unit == "deg" else change
+        along = abs(float((p1 - p0) @ turned[:3])) / max(1e-9, float(sine))
+        if abs(angle - change) > 0.3 * change + 0.01:
+            got = f"the hand turned by {angle:.3g} rad for {change:.3g} rad of {layout.names[joint]}"
+            self.find("pose", got, "the same angle", "correct the rotation of the pose, or the unit of the joints")
+        # The tolerance is for what other joints give way: 1 mm, and a sixth of the hand's way.
+        if along > 0.001 + float(np.linalg.norm(p1 - p0)) / 6:
+            got = f"a hand that moved {1e3 * along:.2g} mm along the axis about which it turned"
+            self.find("pose", got, "a motion about the joint's axis", "give the quaternion as xyzw, not as wxyz")
+
+    def _check_single_commands(self, layout: _Layout, name: str) -> None:
+        half = layout.step / 2
+        for number in range(6):
+            before = layout.measured(self._observe())[0]
+            self._apply(layout.changed(self._command, 0, half if number % 2 == 0 else -half))
+            self._clock.sleep(2 * self._latency_s)
+            if abs(layout.measured(self._observe())[0] - before) < 0.4 * half:
+                got = f"no motion of {name} at command {number + 1} of 6 single ones"
+                self.find("commands", got, "a motion at each", "commands are dropped: check bus and network")
+
+    def _check_stop_in_motion(self, layout: _Layout, name: str) -> None:
+        before = layout.measured(self._observe())[0]
+        self._apply(layout.changed(self._command, 0, layout.step))
+        self._robot.stop()
+        self._clock.sleep(2 * self._latency_s)
+        moved = abs(layout.measured(self._observe())[0] - before)
+        if moved > layout.step / 2:
+            got = f"{name} went on by {moved:.3g} after stop"
+            self.find("stop", got, "rest at once", "make the measured pose the target in stop, and drop commands")
+        self._command = self._hold_command(layout, self._observe())
+
+    def _check_grippers(self, layout: _Layout) -> None:
+        spec, obs = self._contract.action, self._observe()
+        if not layout.grippers or obs.gripper is None or spec.gripper_closed is None:
+            self.report.skipped["gripper"] = "the contract states no gripper"
+            return
+        if not self._agreed("closing and opening the gripper"):
+            return
+        action = self._hold_command(layout, obs)
+        openings = []
+        for goal in (spec.gripper_open, spec.gripper_closed, spec.gripper_open):
+            action[layout.grippers] = goal
+            self._apply(action)
+            self._clock.sleep(2.0)
+            openings.append(self._observe().gripper or 0.0)
+            saw = self._operator.saw_closing() if self._operator is not None and goal == spec.gripper_closed else None
+            if len(openings) == 2 and saw is None:
+                self.report.skipped["gripper"] = "the operator could not tell whether it closed"
+            if len(openings) == 2 and (openings[1] > openings[0] - 0.3 or saw is False):
+                got = f"an opening of {openings[0]:.2g} before and {openings[1]:.2g} after the command to close"
+                cure = "exchange gripper_open and gripper_closed of the contract, and give 1 for open in observe"
+                self.find("gripper", got, "a gripper that closes, and a smaller opening", cure)
+        self._passes("gripper")
+
+
+@dataclass(frozen=True)
+class _Layout:
+    """The numbers of an action, and the parts of the state that measure them."""
+
+    dim: int
+    names: list[str]  # of the joints
+    limits: np.ndarray  # (D, 2), of the joints; infinite if the robot has no `joint_limits`
+    joints: list[int]  # their numbers in an action
+    grippers: list[int]
+    parts: list[str]  # of the state, which together have the joints
+    pose_of: list[str | None]  # of each joint, the part with the pose of its hand
+    unit: str
+    relative: bool
+
+    @classmethod
+    def find(cls, robot: Robot, contract: Contract, obs: Obs) -> _Layout | None:
+        """Return the layout; None if actions are not joints, each arm's gripper after them."""
+        action: ActionSpec = contract.action
+        if action.space not in (None, "joint") or action.dim is None:
+            return None
+        parts = [key for arm in action.arms or ("",) if (key := arm_part(arm, "joints")) in obs.state]
+        counts = [len(obs.state[part]) for part in parts]
+        each = (action.dim - sum(counts)) // max(1, len(parts))
+        if not parts or each not in (0, 1) or sum(counts) + each * len(parts) != action.dim:
+            return None
+        joints: list[int] = []
+        grippers: list[int] = []
+        poses: list[str | None] = []
+        for part, count in zip(parts, counts, strict=True):
+            at = len(joints) + len(grippers)
+            joints += range(at, at + count)
+            grippers += range(at + count, at + count + each)
+            pose = part.replace("joints", "tquat")
+            poses += [pose if pose in obs.state else None] * count
+        names = list(getattr(robot, "joint_names", ()))
+        if len(names) != len(joints):
+            names = [f"joint {number}" for number in range(len(joints))]
+        limits = np.asarray(getattr(robot, "joint_limits", [(-np.inf, np.inf)] * len(joints)))
+        if limits.shape != (len(joints), 2):
+            raise ConfigError(f"joint_limits: got {limits.shape}, want ({len(joints)}, 2), a low and a high for each")
+        unit = ((contract.state or {}).get(parts[0]) or StateSpec()).unit or "rad"
+        return cls(action.dim, names, limits, joints, grippers, parts, poses, unit, bool(action.relative))
+
+    @property
+    def step(self) -> float:
+        """The size of a small move, in the unit of the joints."""
+        return _STEPS.get(self.unit, _OTHER_STEP)
+
+    def changed(self, last: np.ndarray, joint: int, change: float) -> np.ndarray:
+        """Return the action that moves one joint by `change` from where the `last` action, (dim,), put it."""
+        action = last.copy()
+        if self.relative:
+            action[self.joints] = 0
+        action[self.joints[joint]] += change
+        return action
+
+    def measured(self, obs: Obs) -> np.ndarray:
+        """Return the measured joints in the order of an action, (D,)."""
+        return np.concatenate([obs.state[part] for part in self.parts]).astype(float)
+
+
+@dataclass(frozen=True)
+class _Card:
+    """What a card changed in a picture."""
+
+    red: bool  # else blue
+    x: float  # of its middle, in [0, 1] from the left
+    y: float  # from the top
+    share: float  # of all pixels
+
+
+def _card(before: np.ndarray, after: np.ndarray) -> _Card | None:
+    """Find the pixels of (H, W, 3) uint8 pictures that became red, or blue where red and blue are exchanged."""
+    red, green, blue = np.moveaxis(after.astype(int), -1, 0)
+    changed = np.abs(after.astype(int) - before).max(-1) > _RED
+    masks = [changed & (one - np.maximum(green, other) > _RED) for one, other in ((red, blue), (blue, red))]
+    larger = max(masks, key=np.count_nonzero)
+    if np.count_nonzero(larger) < 1e-3 * larger.size:
+        return None
+    rows, columns = np.nonzero(larger)
+    height, width = larger.shape
+    return _Card(larger is masks[0], columns.mean() / width, rows.mean() / height, len(rows) / larger.size)
+
+
+def arm_part(arm: str, name: str) -> str:
+    """Return the name of a part of the state for an arm; "" is the only one."""
+    return f"{arm}/{name}" if arm else name
+
+
+def _times(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """Multiply quaternions xyzw."""
+    vector = a[3] * b[:3] + b[3] * a[:3] + np.cross(a[:3], b[:3])
+    return np.array([*vector, a[3] * b[3] - a[:3] @ b[:3]])

@@ -1,0 +1,114 @@
+"""A robot class of LeRobot as a robot here: `--robot lerobot:so101_follower`."""
+
+from __future__ import annotations
+
+import contextlib
+import importlib
+import pkgutil
+import time
+from typing import Any
+
+import numpy as np
+
+from vlagents_ray.contract import ActionSpec, CameraSpec, Contract, StateSpec
+from vlagents_ray.errors import ConfigError, InvalidAction
+from vlagents_ray.interface import CAPTURED, Obs
+from vlagents_ray.naming import did_you_mean
+from vlagents_ray.registry import require
+
+
+class LeRobotRobot:
+    """Any robot that LeRobot drives, by the name that its configuration registers.
+
+    Joints stay in LeRobot's order and units, which are those of its datasets and of policies that were trained on
+    them. The part `joints`, (D,), of an observation and an action have the same numbers, the gripper among them.
+
+    Args:
+        kind: The registered name, such as "so101_follower".
+        unit: The unit of the joints; by default "deg", or "%" of the calibrated range, as its `use_degrees` says.
+        settings: The fields of its configuration, such as `port="/dev/ttyACM0"`, `id="my_arm"` and `cameras`.
+
+    Raises:
+        ConfigError: LeRobot has no such robot, a setting is wrong, or the robot is not calibrated.
+        MissingDependency: LeRobot, or the driver of the robot's motors, is not installed.
+    """
+
+    def __init__(self, kind: str, *, unit: str = "", **settings: Any) -> None:
+        package = require("lerobot.robots")
+        for folder in (package, require("lerobot.cameras")):
+            for module in pkgutil.iter_modules(folder.__path__):
+                with contextlib.suppress(ImportError):  # of a robot whose driver is not installed
+                    importlib.import_module(f"{folder.__name__}.{module.name}")  # registers its configurations
+        require("lerobot.utils.import_utils").register_third_party_plugins()
+        try:
+            config = importlib.import_module("draccus").decode(package.RobotConfig, {"type": kind, **settings})
+            self._robot = require("lerobot.robots.utils").make_robot_from_config(config)
+        except Exception as error:
+            near = did_you_mean(kind, package.RobotConfig.get_known_choices())
+            raise ConfigError(f"lerobot:{kind}: LeRobot refuses the settings {settings} ({error}){near}") from error
+        others = [name for name in self._robot.action_features if not name.endswith(".pos")]
+        if others:
+            raise ConfigError(f"lerobot:{kind}: got actions {others}, want positions of joints, NAME.pos")
+        self._robot.connect(calibrate=False)
+        if not self._robot.is_calibrated:
+            self._robot.disconnect()
+            raise ConfigError(f"lerobot:{kind}: not calibrated; run lerobot-calibrate --robot.type={kind} with its id")
+        self._unit = unit or ("deg" if getattr(config, "use_degrees", False) else "%")
+        self._keys = list(self._robot.action_features)
+
+    @property
+    def joint_names(self) -> list[str]:
+        """The names of the motors, in the order of an action."""
+        return [key.removesuffix(".pos") for key in self._keys]
+
+    @property
+    def joint_limits(self) -> np.ndarray:
+        """The limits of the motors by LeRobot's settings and calibration, (D, 2) in their unit; infinite if unknown."""
+        return np.array([self._limits_of(name) for name in self.joint_names])
+
+    def _limits_of(self, name: str) -> tuple[float, float]:
+        if name in (stated := getattr(getattr(self._robot, "config", None), "joint_limits", None) or {}):
+            return stated[name]  # type: ignore[no-any-return]
+        bus: Any = getattr(self._robot, "bus", None)
+        motor: Any
+        ends: Any
+        motor, ends = (getattr(bus, table, {}).get(name) for table in ("motors", "calibration"))
+        mode = getattr(getattr(motor, "norm_mode", None), "name", "")
+        if mode == "DEGREES" and ends is not None and hasattr(bus, "model_resolution_table"):
+            half = 180 * (ends.range_max - ends.range_min) / (bus.model_resolution_table[motor.model] - 1)
+            return -half, half
+        return {"RANGE_M100_100": (-100.0, 100.0), "RANGE_0_100": (0.0, 100.0)}.get(mode, (-np.inf, np.inf))
+
+    @property
+    def contract(self) -> Contract:
+        """The cameras, the joints and the actions, by LeRobot's features."""
+        features = self._robot.observation_features
+        cameras = {name: CameraSpec(*shape[:2]) for name, shape in features.items() if isinstance(shape, tuple)}
+        return Contract(
+            cameras=cameras,
+            state={"joints": StateSpec(len(self._keys), self._unit)},
+            gripper=False,
+            action=ActionSpec(dim=len(self._keys), space="joint", delta=False),
+        )
+
+    def observe(self) -> Obs:
+        """Return what LeRobot reads; the first reading begins now."""
+        at = time.time()
+        seen = self._robot.get_observation()
+        joints = np.array([seen[key] for key in self._keys], np.float32)
+        images = {name: np.asarray(seen[name]) for name in self.contract.cameras or {}}
+        return Obs(images, None, {"joints": joints}, {CAPTURED: at})
+
+    def apply(self, action: np.ndarray) -> None:
+        """Send the goal positions."""
+        if np.shape(action) != (len(self._keys),):
+            raise InvalidAction(f"action: got {np.shape(action)}, want ({len(self._keys)},): {self._keys}")
+        self._robot.send_action(dict(zip(self._keys, map(float, action), strict=True)))
+
+    def stop(self) -> None:
+        """Make the measured positions the goal; torque stays on, so that the arm does not fall."""
+        self.apply(self.observe().state["joints"])
+
+    def close(self) -> None:
+        """Disconnect; whether torque is released is a setting of LeRobot's configuration."""
+        self._robot.disconnect()

@@ -1,0 +1,438 @@
+"""Arms in MuJoCo as robots: SO-101, Franka, ALOHA, UR5e, xArm7, and any other MJCF or URDF file; extra "arms"."""
+
+from __future__ import annotations
+
+import os
+import re
+import time
+from collections import deque
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from vlagents_ray.contract import ActionSpec, CameraSpec, Contract, StateSpec
+from vlagents_ray.errors import ConfigError, InvalidAction
+from vlagents_ray.interface import CAPTURED, Obs
+from vlagents_ray.naming import did_you_mean
+from vlagents_ray.registry import require
+from vlagents_ray.robot.check import Operator, arm_part
+
+_SETTLING_S = 1.0
+_GRIPPER = re.compile(r"gripper|finger|knuckle|jaw|fingers_actuator")
+_PREFIX = "vlagents_ray/"  # of what is added to a model, so that no name of the model is taken
+_KP, _KV = 1000.0, 100.0  # gains of a controller for a model without one, N m/rad and N m s/rad
+_RED = (220, 20, 30)  # the card of `SimulatedOperator`
+
+
+@dataclass(frozen=True)
+class ArmModel:
+    """What a model file does not state of an arm."""
+
+    menagerie: str  # folder of the model in the MuJoCo Menagerie
+    rest: tuple[float, ...] = ()  # of each joint without the gripper, rad; the file's first keyframe if empty
+    open_high: bool = True  # whether the gripper opens towards the upper end of its range
+    arms: tuple[str, ...] = ()  # the names of several arms, in the order of the file
+
+
+_PANDA = (0.0, -0.3, 0.0, -1.9, 0.0, 1.6, 0.8)
+_ALOHA = (0.0, -0.96, 1.16, 0.0, -0.3, 0.0)
+ARMS = {
+    "so101": ArmModel("robotstudio_so101", rest=(0.2, -0.6, 0.5, 0.8, 0.1)),
+    "franka": ArmModel("franka_emika_panda", rest=_PANDA),
+    "aloha": ArmModel("aloha", rest=2 * _ALOHA, arms=("left", "right")),
+    "ur5e": ArmModel("universal_robots_ur5e"),
+    "xarm7": ArmModel("ufactory_xarm7", rest=(0.0, -0.25, 0.0, 0.9, 0.0, 1.1, 0.0), open_high=False),
+}
+
+
+class SimulatedClock:
+    """The part of the module `time` that robots and their check use, in simulated time."""
+
+    def __init__(self) -> None:
+        self._now_s = 0.0
+        self._began_s = time.time()
+
+    def monotonic(self) -> float:
+        """Return the simulated time since the start, s."""
+        return self._now_s
+
+    def time(self) -> float:
+        """Return the simulated time since 1970, s."""
+        return self._began_s + self._now_s
+
+    def sleep(self, seconds: float) -> None:
+        """Let simulated time pass."""
+        self._now_s += seconds
+
+
+@dataclass(slots=True)
+class _Drive:
+    """The actuators that one number of an action moves, and their ends: of a joint, or of a gripper's fingers."""
+
+    name: str
+    actuators: list[int] = field(default_factory=list)
+    low: list[float] = field(default_factory=list)  # of each actuator: its control at 0; of a joint its lower limit
+    high: list[float] = field(default_factory=list)  # at 1, which is open; of a joint its upper limit
+    gripper: bool = False
+
+
+class MujocoArm:
+    """A simulated arm with a position controller, cameras, latency and measured joints.
+
+    An action has the target of each joint, rad, and then the gripper's opening in [0, 1], 1 = open, for each arm in
+    turn. An observation has the part `joints`, (D,) rad, and `tquat`, (7,) the pose of the hand in the frame of the
+    arm's base, m and quaternion xyzw; with two arms `left/joints` and so on. `contract`, `joint_names`, `joint_limits`
+    and `operator` describe the arm to the loop and to the check of a robot. Physics advance with `clock` whenever a
+    method is called. `simulated` is True, so that a stop ends by itself.
+
+    Args:
+        model: A name of `ARMS` or of the MuJoCo Menagerie, or the path of an MJCF or URDF file. Names need the package
+            `mujoco-menagerie`, which downloads a model at its first use, or finds it in the folder MENAGERIE_ROOT.
+        like: A name of `ARMS` whose rest pose, gripper and arms a file has.
+        cameras: Names of the cameras. "front" looks at the arm; any other is on the hand of an arm in turn.
+        size: Height and width of the pictures, px.
+        fps: The rate of the cameras, Hz.
+        delta: Whether actions are relative to the joints' last targets.
+        latency_s: Time from `apply` until the controller has the command, s.
+        speed: The largest speed at which the controller moves a joint's target, rad/s.
+        clock: The module `time`, or a `SimulatedClock`.
+
+    Raises:
+        ConfigError: The model is unknown, or has no arm.
+        MissingDependency: MuJoCo or the Menagerie is not installed.
+    """
+
+    simulated = True
+
+    def __init__(
+        self,
+        model: str | Path = "so101",
+        *,
+        like: str = "",
+        cameras: Sequence[str] = ("front", "wrist"),
+        size: tuple[int, int] = (120, 160),
+        fps: float = 30.0,
+        delta: bool = False,
+        latency_s: float = 0.03,
+        speed: float = 1.5,
+        clock: Any = time,
+    ) -> None:
+        if not os.environ.get("DISPLAY"):
+            os.environ.setdefault("MUJOCO_GL", "egl")
+        self._mujoco = mujoco = require("mujoco", extra="arms")
+        stated = ARMS.get(like or str(model), ArmModel(str(model)))
+        self.clock, self.delta, self.speed = clock, delta, speed
+        self.arms = stated.arms or ("",)
+        self._latency_s, self._size, self._frame_s = latency_s, size, 1 / fps
+        self._queue: deque[tuple[float, np.ndarray]] = deque()
+        self._goal = self._target = np.zeros(0)  # the commanded targets, and those on the way to them at `speed`
+        self._renderer: Any = None
+        self._pictures: dict[str, np.ndarray] = {}
+        self._card: str | None = None  # the camera before which the operator holds the red card
+        self._pictures_s = -np.inf
+        spec = _read(mujoco, stated, str(model))
+        _add_actuators(mujoco, spec)
+        self._compile(spec, stated)
+        self._add_scene(spec, cameras)  # by the places of the hands at rest
+        self._compile(spec, stated)
+        self._cameras = {name: self.model.camera(_PREFIX + name).id for name in cameras}
+        self._begun_s = clock.monotonic() - self.data.time
+        joints = [drive for drive in self._flat if not drive.gripper]
+        self.joint_names = [drive.name for drive in joints]
+        self.joint_limits = np.array([(drive.low[0], drive.high[0]) for drive in joints])
+        self.operator = SimulatedOperator(self)
+        state = {}
+        for arm, drives in zip(self.arms, self._drives, strict=True):
+            state[arm_part(arm, "joints")] = StateSpec(sum(not drive.gripper for drive in drives), "rad")
+            state[arm_part(arm, "tquat")] = StateSpec(7, "m+quat_xyzw")
+        grips = len(joints) < len(self._flat)
+        self.contract = Contract(
+            cameras={name: CameraSpec(*size) for name in cameras},
+            state=state,
+            gripper=grips,
+            action=ActionSpec(
+                dim=len(self._flat),
+                space="joint",
+                delta=delta,
+                gripper_open=1.0 if grips else None,
+                gripper_closed=0.0 if grips else None,
+                arms=self.arms if self.arms != ("",) else None,
+            ),
+        )
+
+    def observe(self) -> Obs:
+        """Return what encoders and cameras measure now."""
+        self._advance()
+        now_s = self.clock.monotonic()
+        if now_s - self._pictures_s >= self._frame_s:
+            self._pictures, self._pictures_s = self.render(), now_s
+        state, openings = {}, []
+        for number, (arm, drives) in enumerate(zip(self.arms, self._drives, strict=True)):
+            measured = [self._measured(drive) for drive in drives if not drive.gripper]
+            state[arm_part(arm, "joints")] = np.array(measured, np.float32)
+            state[arm_part(arm, "tquat")] = self.hand_pose(number)
+            openings += [self._measured(drive) for drive in drives if drive.gripper]
+        opening = float(np.clip(np.mean(openings), 0, 1)) if openings else None
+        images = {name: picture.copy() for name, picture in self._pictures.items()}
+        return Obs(images, opening, state, {CAPTURED: self.clock.time()})
+
+    def apply(self, action: np.ndarray) -> None:
+        """Set the targets, which the controller reads after the latency."""
+        action = np.asarray(action, np.float64)
+        if action.shape != (len(self._flat),):
+            raise InvalidAction(f"action: got {action.shape}, want ({len(self._flat)},); see the contract")
+        self._advance()
+        self._queue.append((self._now() + self._latency_s, action))
+
+    def stop(self) -> None:
+        """Make the measured positions the targets; the gripper keeps its grasp."""
+        self._advance()
+        self._queue.clear()
+        held = [self._goal[i] if drive.gripper else self._measured(drive) for i, drive in enumerate(self._flat)]
+        self._goal = self._target = np.array(held)
+
+    def close(self) -> None:
+        """Close the renderer."""
+        if self._renderer is not None:
+            self._renderer.close()
+            self._renderer = None
+
+    def joints(self) -> np.ndarray:
+        """Return the true positions of the joints of `joint_names`, (D,) rad."""
+        self._advance()
+        return np.array([self._measured(drive) for drive in self._flat if not drive.gripper])
+
+    def opening(self) -> float:
+        """Return the true opening of the grippers in [0, 1]."""
+        self._advance()
+        return float(np.mean([self._measured(drive) for drive in self._flat if drive.gripper] or [1.0]))
+
+    def hand_pose(self, number: int = 0) -> np.ndarray:
+        """Return the pose of an arm's hand in the frame of its base, (7,) m and quaternion xyzw."""
+        position, rotation = self._pose(self._hands[number])
+        base, turned = self._pose(self._bases[number])
+        quaternion = np.zeros(4)
+        self._mujoco.mju_mat2Quat(quaternion, (turned.T @ rotation).ravel())
+        return np.array([*(turned.T @ (position - base)), *quaternion[1:], quaternion[0]], np.float32)
+
+    def hold_card(self, camera: str | None) -> None:
+        """Show something red in the upper left of what a camera sees; None takes it away."""
+        self._card, self._pictures_s = camera, -np.inf
+
+    def render(self) -> dict[str, np.ndarray]:
+        """Return the present pictures of all cameras, (H, W, 3) uint8 RGB."""
+        if self._renderer is None and self._cameras:
+            self._renderer = self._mujoco.Renderer(self.model, *self._size)
+            self._renderer.scene.flags[self._mujoco.mjtRndFlag.mjRND_SHADOW] = False  # half of the time of a picture
+        pictures = {}
+        for name, index in self._cameras.items():
+            self._renderer.update_scene(self.data, index)
+            pictures[name] = picture = self._renderer.render()
+            if name == self._card:
+                height, width = np.array(picture.shape[:2]) // 8
+                picture[height : 3 * height, width : 3 * width] = _RED
+        return pictures
+
+    def _now(self) -> float:
+        return float(self.clock.monotonic() - self._begun_s)
+
+    def _advance(self) -> None:
+        """Step the physics up to the present."""
+        now_s, step_s = self._now(), self.model.opt.timestep
+        while self.data.time + step_s <= now_s:
+            while self._queue and self._queue[0][0] <= self.data.time:
+                _, action = self._queue.popleft()
+                relative = [self.delta and not drive.gripper for drive in self._flat]
+                goal = np.where(relative, self._goal + action, action)
+                ends = [(0.0, 1.0) if drive.gripper else (drive.low[0], drive.high[0]) for drive in self._flat]
+                self._goal = np.clip(goal, *np.transpose(ends))
+            most = self.speed * step_s
+            self._target = self._target + np.clip(self._goal - self._target, -most, most)
+            self._control(self._target)
+            self._mujoco.mj_step(self.model, self.data)
+
+    def _control(self, targets: np.ndarray) -> None:
+        for drive, target in zip(self._flat, targets, strict=True):
+            for actuator, low, high in zip(drive.actuators, drive.low, drive.high, strict=True):
+                self.data.ctrl[actuator] = low + target * (high - low) if drive.gripper else target
+
+    def _measured(self, drive: _Drive) -> float:
+        actuator, low, high = drive.actuators[0], drive.low[0], drive.high[0]
+        length = float(self.data.actuator_length[actuator])
+        if not drive.gripper:
+            return length
+        control = -length * float(self.model.actuator_biasprm[actuator, 1] / self.model.actuator_gainprm[actuator, 0])
+        return (control - low) / (high - low)
+
+    def _compile(self, spec: Any, stated: ArmModel) -> None:
+        self.model = spec.compile()
+        self.data = self._mujoco.MjData(self.model)
+        self._drives = self._read_drives(stated)
+        self._flat = [drive for drives in self._drives for drive in drives]
+        if not all(any(not drive.gripper for drive in drives) for drives in self._drives):
+            raise ConfigError(f"{stated.menagerie}: got an arm without joints that move, want the file of an arm")
+        self._hands = [self._hand(drives) for drives in self._drives]
+        self._bases = [int(self.model.body_rootid[hand]) for hand in self._hands]
+        self._rest(stated)
+
+    def _add_scene(self, spec: Any, cameras: Sequence[str]) -> None:
+        """Add a floor, a light and the cameras: "front" in the world, the others on the hands."""
+        spec.stat.extent, spec.visual.map.znear = 1.0, 0.01  # what is 1 cm from a camera is drawn
+        world = spec.worldbody
+        world.add_light(pos=[0, 0, 3], dir=[0.2, 0.1, -1])
+        # The floor touches nothing; with 0, URDF files lose it as a visual.
+        floor = {"size": [3, 3, 0.1], "pos": [0, 0, -0.01], "contype": 1 << 20, "conaffinity": 0}
+        world.add_geom(type=self._mujoco.mjtGeom.mjGEOM_PLANE, rgba=[0.45, 0.45, 0.42, 1], **floor)
+        hands = [self._pose(hand) for hand in self._hands]
+        centre = np.mean([position for position, _ in hands] + [self.data.xpos[base] for base in self._bases], axis=0)
+        reach = max(np.linalg.norm(p - self.data.xpos[b]) for (p, _), b in zip(hands, self._bases, strict=True))
+        number = 0
+        for name in cameras:
+            if name == "front":
+                away = np.array([1.5, 1.0, 1.0]) * reach
+                camera = {"pos": centre + away, "quat": self._looking(-away, np.eye(3))}
+                world.add_camera(name=_PREFIX + name, fovy=60, **camera)
+                continue
+            hand, base = self._hands[number], self._bases[number]
+            number = (number + 1) % len(hands)
+            position, rotation = self._pose(hand)
+            out = (position - self.data.xpos[base]) * [1, 1, 0]
+            up = np.array([0, 0, 0.12])
+            view = 0.15 * out / max(1e-3, float(np.linalg.norm(out))) - 1.5 * up
+            camera = {"pos": rotation.T @ up, "quat": self._looking(view, rotation)}
+            spec.body(self.model.body(hand).name).add_camera(name=_PREFIX + name, fovy=75, **camera)
+
+    def _looking(self, view: np.ndarray, frame: np.ndarray) -> np.ndarray:
+        """Return the rotation, wxyz in a frame, of a camera that looks into a direction of the world."""
+        back = -view / np.linalg.norm(view)
+        right = np.cross([0.0, 0.0, 1.0], back)
+        right /= np.linalg.norm(right)
+        quaternion = np.zeros(4)
+        self._mujoco.mju_mat2Quat(quaternion, (frame.T @ np.stack([right, np.cross(back, right), back], 1)).ravel())
+        return quaternion
+
+    def _rest(self, stated: ArmModel) -> None:
+        """Begin at the rest pose with open grippers, and let the arm settle."""
+        if self.model.nkey:
+            self._mujoco.mj_resetDataKeyframe(self.model, self.data, 0)
+        rest = iter(stated.rest)
+        self._mujoco.mj_forward(self.model, self.data)
+        goal = [1.0 if drive.gripper else next(rest, self._measured(drive)) for drive in self._flat]
+        for drive, target in zip(self._flat, goal, strict=True):
+            joint = int(self.model.actuator_trnid[drive.actuators[0], 0])
+            if not drive.gripper:
+                self.data.qpos[self.model.jnt_qposadr[joint]] = target
+        self._goal = self._target = np.array(goal)
+        self._control(self._goal)
+        while self.data.time < _SETTLING_S:
+            self._mujoco.mj_step(self.model, self.data)
+
+    def _read_drives(self, stated: ArmModel) -> list[list[_Drive]]:
+        """Group the actuators by arm and by number of an action."""
+        arms: list[list[_Drive]] = [[] for _ in self.arms]
+        grippers = [_Drive("gripper", gripper=True) for _ in self.arms]
+        for index in range(self.model.nu):
+            of_joint = self.model.actuator_trntype[index] == self._mujoco.mjtTrn.mjTRN_JOINT
+            joint = self.model.joint(int(self.model.actuator_trnid[index, 0])).name if of_joint else ""
+            name = self.model.actuator(index).name or joint
+            number = next((i for i, arm in enumerate(self.arms) if arm and arm in f"{name} {joint}"), 0)
+            if self.model.actuator_biasprm[index, 1] == 0:
+                raise ConfigError(f"{stated.menagerie}: actuator {name!r} has no position controller, want one each")
+            low, high = (float(end) for end in self.model.actuator_ctrlrange[index])
+            if of_joint and low >= high:  # not limited
+                joint_range = self.model.jnt_range[self.model.actuator_trnid[index, 0]]
+                low, high = map(float, joint_range if joint_range[0] < joint_range[1] else (-2 * np.pi, 2 * np.pi))
+            if _GRIPPER.search(name) or _GRIPPER.search(joint) or not of_joint:
+                # Of two fingers that move against each other, one has its open end where its number is small.
+                rising = stated.open_high if abs(high) >= abs(low) else not stated.open_high
+                drive = grippers[number]
+                drive.low.append(low if rising else high)
+                drive.high.append(high if rising else low)
+            else:
+                drive = _Drive(name, low=[low], high=[high])
+                arms[number].append(drive)
+            drive.actuators.append(index)
+        return [[*drives, *([grip] if grip.actuators else [])] for drives, grip in zip(arms, grippers, strict=True)]
+
+    def _hand(self, drives: Sequence[_Drive]) -> int:
+        last = [drive for drive in drives if not drive.gripper][-1]
+        return int(self.model.jnt_bodyid[int(self.model.actuator_trnid[last.actuators[0], 0])])
+
+    def _pose(self, body: int) -> tuple[np.ndarray, np.ndarray]:
+        return self.data.xpos[body], self.data.xmat[body].reshape(3, 3)
+
+
+def _read(mujoco: Any, stated: ArmModel, model: str) -> Any:
+    """Return the specification of a model file, which MuJoCo can compile."""
+    file = Path(model)
+    if file.suffix not in (".xml", ".mjcf", ".urdf"):
+        menagerie = require("mujoco_menagerie", extra="arms")
+        known = menagerie.names()
+        if stated.menagerie not in known:
+            raise ConfigError(
+                f"arm: got {model!r}, want one of {list(ARMS)}, a model of the MuJoCo Menagerie, or the path of an "
+                f"MJCF or URDF file{did_you_mean(model, [*ARMS, *known])}"
+            )
+        robot = menagerie.get(stated.menagerie)
+        try:
+            return robot.spec(robot.default_model)
+        except menagerie.MenagerieError as error:
+            cure = "without a network, MENAGERIE_ROOT names a folder with the models, or give the path of a file"
+            raise ConfigError(
+                f"arm {model!r}: the MuJoCo Menagerie has no file of it here ({error}); {cure}"
+            ) from error
+    if not file.is_file():
+        raise ConfigError(f"arm: got {model!r}, want a file that exists")
+    if file.suffix != ".urdf":
+        return mujoco.MjSpec.from_file(str(file))
+    compiler = f'<compiler meshdir="{file.absolute().parent}" strippath="false" fusestatic="false"/>'
+    text = re.sub(r"(<robot[^>]*>)", rf"\1<mujoco>{compiler}</mujoco>", file.read_text(), count=1)
+    return mujoco.MjSpec.from_string(text.replace("package://", ""))
+
+
+def _add_actuators(mujoco: Any, spec: Any) -> None:
+    """Give each joint of a model without actuators, such as a URDF, a position controller that carries its weight."""
+    if spec.actuators:
+        return
+    spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
+    for body in spec.bodies:
+        body.gravcomp = 1
+    for joint in spec.joints:
+        joint.armature = 0.1
+        spec.add_actuator(
+            name=joint.name, target=joint.name, trntype=mujoco.mjtTrn.mjTRN_JOINT,
+            biastype=mujoco.mjtBias.mjBIAS_AFFINE, gainprm=[_KP, *[0] * 9], biasprm=[0, -_KP, -_KV, *[0] * 7],
+            ctrlrange=joint.range if joint.range[0] < joint.range[1] else [-np.pi, np.pi], ctrllimited=True,
+        )  # fmt: skip
+
+
+class SimulatedOperator(Operator):
+    """A person at a simulated arm, who agrees to every motion and sees what the arm does."""
+
+    def __init__(self, arm: MujocoArm) -> None:
+        self._arm = arm
+        self._before = arm.joints()
+
+    def agrees(self, motion: str) -> bool:
+        self._before = self._arm.joints()
+        return True
+
+    def holds_card(self, camera: str | None) -> bool:
+        self._arm.hold_card(camera)
+        return True
+
+    def saw_joint(self, name: str, side: int) -> bool | None:
+        moved = self._arm.joints() - self._before
+        most = int(np.argmax(np.abs(moved)))
+        return self._arm.joint_names[most] == name and bool(moved[most] * side > 0)
+
+    def saw_closing(self) -> bool | None:
+        return self._arm.opening() < 0.5
+
+    def sees_hand(self, pose: np.ndarray, arm: int = 0) -> bool | None:
+        """Return whether the hand is within 10 cm and about 25° of a pose in the frame of its base."""
+        true = self._arm.hand_pose(arm)
+        return bool(np.linalg.norm(true[:3] - pose[:3]) < 0.1 and abs(true[3:] @ pose[3:]) > 0.975)
