@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -12,9 +11,10 @@ import torch
 from lerobot.policies.rtc.configuration_rtc import RTCConfig
 
 from benchmarks.checkpoints.lerobot import local_tokenizer
+from benchmarks.checkpoints.tokenizer import fast_tokenizer
 from tests.families.lerobot import tiny
 from tests.families.lerobot.conftest import begun, view
-from tests.families.lerobot.test_pi import _loaded, _normalised, made, shrunk  # noqa: F401 - fixtures
+from tests.families.lerobot.test_pi import _loaded, _normalised, shrunk  # noqa: F401 - a fixture
 from tests.families.lerobot.test_upstream import Theirs, draws_of
 from vlagents_ray.interface import DELAY, LEFTOVER
 from vlagents_ray.policies.lerobot.kinds import LONGEST_PREFIX
@@ -23,14 +23,16 @@ LONGEST = 4
 
 
 @pytest.fixture(scope="module")
-def trained(made: Callable[[str], Path], tmp_path_factory: pytest.TempPathFactory) -> Path:  # noqa: F811
+def trained(shrunk: pytest.MonkeyPatch, tmp_path_factory: pytest.TempPathFactory) -> Path:  # noqa: F811
     """A checkpoint of π0.5 whose config says that it was trained with prefixes."""
     folder = tmp_path_factory.mktemp("prefixed")
     chunk = {"chunk_size": tiny.CHUNK, "n_action_steps": tiny.EXECUTED, "num_inference_steps": 3}
-    with local_tokenizer("pi05", made("pi05").parent / "tokenizer"):
+    (folder / "pi05").mkdir()
+    fast_tokenizer().save_pretrained(folder / "tokenizer")
+    with local_tokenizer("pi05", folder / "tokenizer"):
         sizes = {"dtype": "float32", "image_resolution": (56, 56), LONGEST_PREFIX: LONGEST}
-        tiny.write(folder, tiny.config_of("pi05", **sizes, **chunk))
-    return folder
+        tiny.write(folder / "pi05", tiny.config_of("pi05", **sizes, **chunk))
+    return folder / "pi05"
 
 
 @pytest.mark.parametrize("mode", ["trained", "guided"])

@@ -227,8 +227,9 @@ class Flow(Kind):
         given = None
         if any(left is not None for left in leftovers):
             plans = [None if left is None else self._encoded(left) for left in leftovers]
-            if self.longest:
-                prefixes = Guide.of(list(map(self._prefixed, rows, plans)), *shape).to(convert)
+            prefixes = Guide.of(list(map(self._prefixed, rows, plans)), *shape) if self.longest else None
+            if prefixes is not None:
+                prefixes = prefixes.to(convert)
                 noise, given = prefixes.given(noise), prefixes.frozen
                 changes.append(prefixes.keep)
             else:
