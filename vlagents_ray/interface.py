@@ -48,7 +48,7 @@ DEADLINE = "deadline_ms"  # in an observation: the time after which `RemoteAgent
 # Real-time chunking (Black, Galliker & Levine 2025, https://arxiv.org/abs/2506.07339), in an observation: when the
 # answer arrives, DELAY rows of LEFTOVER have been executed; the new chunk begins with them, and continues the rest.
 LEFTOVER = "leftover_actions"  # (H', D) float32: the current plan from this observation's tick on
-DELAY = "delay_ticks"  # int: ticks until the answer arrives, the longest recent delay; at most the rows of LEFTOVER
+DELAY = "delay_ticks"  # int: expected ticks until the answer arrives, at most the rows of LEFTOVER; 0: also unknown
 EXECUTED = "executed_actions"  # in an observation, (N, D): actions not of the policy, executed since the last request
 # In the Act of a served policy: its weights, {"version": int, "fingerprint": str}. Version 0 is the loaded checkpoint.
 POLICY = "policy"

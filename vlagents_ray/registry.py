@@ -2,8 +2,8 @@
 
 A name refers to `"module:Class"`, imported only when it is used. Third parties add names through the entry-point
 groups `vlagents_ray.policies`, `vlagents_ray.wrappers`, `vlagents_ray.envs` and `vlagents_ray.dialects`; a
-`"module:Class"` in a deployment file works without registration. Wrappers, which change the observations of
-any policy, are all registered that way.
+`"module:Class"` in a deployment file works without registration. Wrappers change the observations of any policy, or
+its actions.
 
 The tables of README and docs/ are made from this file: `python tests/support/tables.py`.
 """
@@ -225,6 +225,8 @@ ENVS: dict[str, Adapter] = {
     ),
 }
 
+WRAPPERS = {"absolute_actions": "vlagents_ray.policies.absolute_actions:AbsoluteActions"}
+
 # Other systems' protocols: the names under `dialects` in a deployment file. If several serve the server's root path,
 # the first enabled one receives it.
 DIALECTS: dict[str, str] = {
@@ -328,7 +330,8 @@ def _install(package: str, extra: str | None = None) -> str:
 def names(kind: str) -> dict[str, str]:
     """Return all names of `kind` ("policies", "wrappers", "envs" or "dialects") with their "module:Class"."""
     adapters = {"policies": POLICIES, "envs": ENVS}.get(kind, {})
-    own = DIALECTS if kind == "dialects" else {name: one.target for name, one in adapters.items()}
+    plain = {"wrappers": WRAPPERS, "dialects": DIALECTS}
+    own = plain.get(kind) or {name: one.target for name, one in adapters.items()}
     return _registered(f"vlagents_ray.{kind}", tuple(sys.path)) | own
 
 

@@ -9,7 +9,7 @@ import pytest
 from eval_fakes import SimulatedTime
 
 from vlagents_ray import ConfigError, InvalidObservation, Obs, PolicyFailed
-from vlagents_ray.chunking.buffer import CaptureClock, Chunk, ChunkBuffer
+from vlagents_ray.chunking.buffer import CaptureClock, Chunk, ChunkBuffer, DelayEstimate
 
 
 def chunk(number: int, step: int, values: list[float], *, done: bool = False) -> Chunk:
@@ -105,10 +105,29 @@ def test_what_is_left_of_the_plan_is_what_would_be_done() -> None:
 
 def test_a_policy_that_chunks_in_real_time_is_told_of_no_more_rows_than_are_left() -> None:
     plan = ChunkBuffer()
-    assert plan.continuation([3]) == {}
+    assert plan.continuation(3) == {}
     plan.add(chunk(0, 0, [0, 1, 2]))
-    for delays, told in (([], 0), ([1, 2], 2), ([1, 150], 3)):  # of a stall, the whole rest will be executed
-        assert plan.continuation(delays)["delay_ticks"] == told
+    for delay, told in ((0, 0), (2, 2), (150, 3)):  # of a stall, the whole rest will be executed
+        assert plan.continuation(delay)["delay_ticks"] == told
+
+
+@pytest.mark.parametrize(
+    ("delays", "expected"),
+    [
+        ([], 0),
+        ([150], 150),  # a cold start is all that is known
+        ([150, 3], 3),
+        ([150, 140, 3], 3),  # two compiled
+        ([150, 140, 3, 90, 2], 3),  # a stall
+        ([3, 3, *[2] * 5, *[6] * 5], 6),  # a slower network
+        ([3, 3, *[6] * 10, *[2] * 9], 2),  # and a faster one
+    ],
+)
+def test_the_expected_delay_leaves_out_a_cold_start_and_a_stall(delays: list[int], expected: int) -> None:
+    estimate = DelayEstimate()
+    for delay in delays:
+        estimate.add(delay)
+    assert estimate.ticks == expected
 
 
 def test_what_was_planned_from_an_old_observation_is_forgotten() -> None:

@@ -569,3 +569,9 @@ def test_the_delay_of_a_cold_start_counts_only_until_the_next_answer(playing: Pl
     play(player, range(15, 16))
     wait_for(lambda: len(agent.seen) == 6)
     assert [info.get(DELAY) for info in agent.seen[1:]] == [0, 8, 2, 2, 2]
+    let(agent, player)
+    agent.gate.release()
+    player.reset(obs(20))  # the policy is warm in the next episode
+    play(player, range(20, 22))
+    wait_for(lambda: len(agent.seen) == 8)
+    assert agent.seen[-1][DELAY] == 2

@@ -113,7 +113,7 @@ def error_codes() -> Iterator[str]:
 
 def registered() -> Iterator[str]:
     registry = importlib.import_module("vlagents_ray.registry")
-    for kind in ("POLICIES", "ENVS", "DIALECTS"):
+    for kind in ("POLICIES", "WRAPPERS", "ENVS", "DIALECTS"):
         yield f"{kind.lower()}: {', '.join(sorted(getattr(registry, kind)))}"
 
 

@@ -10,7 +10,7 @@ import functools
 import math
 import time
 from collections import deque
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from types import MappingProxyType
 from typing import Any, Literal, NamedTuple
@@ -32,7 +32,6 @@ MERGES: Mapping[str, Merge] = {
     "weighted_average": lambda old, new: 0.3 * old + 0.7 * new,
     "conservative": lambda old, new: 0.7 * old + 0.3 * new,
 }
-DELAYS = 10  # recent answers whose longest delay counts: a single slow answer, often the first, drops out
 ENSEMBLE = "ensemble"
 ENSEMBLE_M = 0.01
 """The m of the weights exp(-m * i), i = 0 for the oldest: Zhao et al. 2023 (ACT, https://arxiv.org/abs/2304.13705), and
@@ -154,10 +153,10 @@ class ChunkBuffer:
             rows.append(step.action)
         return np.stack(rows) if rows else None
 
-    def continuation(self, delays: Iterable[int]) -> dict[str, Any]:
-        """Return the `Obs.info` of a request with real-time chunking; `delays` are the ticks of recent answers."""
+    def continuation(self, delay: int) -> dict[str, Any]:
+        """Return the `Obs.info` of a request with real-time chunking, whose answer is expected in `delay` ticks."""
         rest = self.leftover()
-        return {} if rest is None else {LEFTOVER: rest, DELAY: min(max(delays, default=0), len(rest))}
+        return {} if rest is None else {LEFTOVER: rest, DELAY: min(delay, len(rest))}
 
     def drop(self, before: float = math.inf) -> bool:
         """Drop chunks with observations from before a time, s of `time.monotonic`; return whether there were any."""
@@ -183,6 +182,35 @@ class ChunkBuffer:
         else:
             action = np.asarray(functools.reduce(self._merge, rows), np.float32)
         return Step(action, newest, row)
+
+
+_COLD = 2  # answers: the first ones that continue a plan run passes and sizes of batches that compile only then
+_RECENT = 10  # answers: at 10 ms to 1 s each, the estimate follows a slower network within seconds
+_QUANTILE = 0.9  # too short an estimate makes a jump, too long a one only a later reaction: so not the median
+
+
+class DelayEstimate:
+    """Estimates the delay of the next answer, in ticks, from those of recent answers.
+
+    It is their 0.9 quantile, rounded down to a measured one, so that one slow answer among others does not count. The
+    first two answers may include a cold start, of seconds; they are left out as soon as there is another one.
+    """
+
+    def __init__(self) -> None:
+        self._answers = 0
+        self._recent: deque[int] = deque(maxlen=_RECENT)
+
+    def add(self, ticks: int) -> None:
+        """Add the delay of an answer: the ticks from its observation to its arrival."""
+        if self._answers == _COLD:
+            self._recent.clear()
+        self._answers += 1
+        self._recent.append(ticks)
+
+    @property
+    def ticks(self) -> int:
+        """The delay to expect; 0 before the first answer."""
+        return sorted(self._recent)[int(_QUANTILE * (len(self._recent) - 1))] if self._recent else 0
 
 
 SKEW_S = 0.1  # the largest lead of the clock of a sensor's computer over this machine's clock, s

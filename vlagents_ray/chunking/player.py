@@ -13,12 +13,12 @@ from typing import Any, NamedTuple, get_args
 import numpy as np
 
 from vlagents_ray.chunking.buffer import (
-    DELAYS,
     ENSEMBLE,
     ENSEMBLE_M,
     CaptureClock,
     Chunk,
     ChunkBuffer,
+    DelayEstimate,
     Merge,
     Mode,
     Step,
@@ -218,6 +218,7 @@ class ChunkPlayer(Agent):
         self._plan = ChunkBuffer(ENSEMBLE if settings.mode == "ensemble" else settings.merge, settings.ensemble_m)
         self._asker: AsyncCaller | None = None
         self._contract: Contract | None = None
+        self._delay = DelayEstimate()
         self._begin()
 
     def _begin(self) -> None:
@@ -231,7 +232,6 @@ class ChunkPlayer(Agent):
         self._waiting_since: float | None = None
         self._trouble = WAITING
         self._captured = CaptureClock()
-        self._delays: deque[int] = deque(maxlen=DELAYS)
         self._motion = Motion(self.check)
 
     @property
@@ -259,7 +259,7 @@ class ChunkPlayer(Agent):
         self._choose_safe()
         if self.settings.deadline_s is not None:
             self._note_asked(0, obs)
-            self._take(self._agent.act(obs), 0)
+            self._take(self._agent.act(obs))
             if self._asker is None:
                 self._asker = AsyncCaller(self._agent)
         self._tick = 0
@@ -334,7 +334,7 @@ class ChunkPlayer(Agent):
         if asker is None or self.settings.deadline_s is None:
             if self._wants(tick, obs):
                 self._note_asked(tick, obs)
-                self._take(self._agent.act(stamped(obs, self._extras())), tick)
+                self._take(self._agent.act(stamped(obs, self._extras())))
         else:  # no tick waits for an action that will not be executed
             deadline = begun + (self.settings.deadline_s if self.control.state == "autonomous" else 0.0)
             self._receive(asker.take(), tick)
@@ -393,7 +393,8 @@ class ChunkPlayer(Agent):
         if isinstance(answer, Act):
             try:
                 if not (self._dropped or (self._motion.speeds_up and self._plan.after is not None)):
-                    self._take(answer, tick)
+                    self._delay.add(tick - self._request.tick)
+                    self._take(answer)
                 self._waiting_since = None
             except InvalidAction as error:
                 self._trouble = refused(error)
@@ -402,16 +403,13 @@ class ChunkPlayer(Agent):
             raise answer
         self._trouble = unanswered(answer)
 
-    def _take(self, act: Act, now: int) -> None:
+    def _take(self, act: Act) -> None:
         act = replace(act, info={key: value for key, value in act.info.items() if key not in OF_THE_LOOP})
         tick, step, seen_at = self._request
         rows = Act(check_action(act.action, self._contract)).rows()[: self.settings.horizon]
         if self.settings.mode == "open_loop" and act.done and self.settings.execute is not None:
             # A late answer keeps one row, since the last row states that the task is done.
             rows = rows[: max(self.settings.execute, self._plan.executed + 1 - step)]
-        if self._chunks == 2:  # the first answer after that of `reset` may include a cold start, of seconds
-            self._delays.pop()
-        self._delays.append(now - tick)
         added = self._plan.add(Chunk(self._chunks, step, rows, act.done, act.info, tick, seen_at))
         self._chunks += 1
         self._trouble = WAITING if added else LATE
@@ -423,7 +421,7 @@ class ChunkPlayer(Agent):
             extras[DEADLINE] = self.settings.timeout_s * 1e3
         # The operator's actions replace those of the plan.
         if self.settings.real_time_chunking and self.control.state != "human":
-            extras |= self._plan.continuation(self._delays)
+            extras |= self._plan.continuation(self._delay.ticks)
         return extras
 
     def _led(self, obs: Obs) -> Act:

@@ -204,6 +204,18 @@ class Guide:
         """Return `steer` for a flow from some noise (B, H, D), as a function of velocity, noisy actions and time."""
         return lambda velocity, actions, time: self.steer(velocity, actions, noise, time, steps=steps, limit=limit)
 
+    def given(self, noise: Any) -> Any:
+        """Return noise (B, H, D) with the frozen rows of the plan in it, for a policy that was trained with prefixes.
+
+        Such a policy reads these rows as actions, at flow time 0 (`FlowPasses.sample`'s `given`), and continues them
+        without any correction (training-time action conditioning, https://arxiv.org/abs/2512.05964).
+        """
+        return self.frozen * self.plan + (1.0 - self.frozen) * noise
+
+    def keep(self, velocity: Any, actions: Any, time: float) -> Any:
+        """Return the velocity (B, H, D) that leaves given rows as they are."""
+        return (1.0 - self.frozen) * velocity
+
     def steer(
         self,
         velocity: Any,
@@ -274,6 +286,7 @@ class FlowPasses(abc.ABC):
         self._encode = compilation.core("encode", self.encode)
         self._velocity = compilation.core("velocity", self.velocity)
         self._flows: dict[int, Callable[..., Any]] = {}  # whole flows, by their steps
+        self.by_row = False  # whether `velocity` takes a time for each row of a chunk, (B, H)
 
     def encode_images(self, images: Sequence[Any]) -> Sequence[Any]:
         """Return the input of `encode` for images (P, 3, H, W)."""
@@ -293,7 +306,7 @@ class FlowPasses(abc.ABC):
 
     @abc.abstractmethod
     def velocity(self, encoded: Any, seen: Any, state: Any, actions: Any, times: Any) -> Any:
-        """Return the velocity (B, H, D) of noisy actions (B, H, D) at times (B,)."""
+        """Return the velocity (B, H, D) of noisy actions (B, H, D) at times (B,), or (B, H) with `by_row`."""
 
     def sample(
         self,
@@ -308,6 +321,9 @@ class FlowPasses(abc.ABC):
         steps: int,
         changes: Sequence[Change] = (),
         fingerprints: Sequence[str] = (),
+        given: Any = None,
+        states: Any = None,
+        state_masks: Any = None,
     ) -> Any:
         """Return actions (B, H, D).
 
@@ -322,6 +338,9 @@ class FlowPasses(abc.ABC):
             steps: Of the flow.
             changes: See `follow`.
             fingerprints: The adapter of each row, see `Row.adapter`; empty: none has one.
+            given: With `by_row`, which rows of the chunks are actions already, at time 0: (B, H, 1), 1.0 or 0.0.
+            states: Of a memory, from LeRobot's π0.5 after 0.6.1, and None, as models with a memory are refused.
+            state_masks: As `states`.
         """
         torch = require("torch")
         firsts = [list(owners).index(place) for place in range(len(mask))] if fingerprints else []
@@ -336,17 +355,22 @@ class FlowPasses(abc.ABC):
             encoded, seen, state = encoded[index], seen[index], state[index]
 
         if not changes and steps not in self._flows:
-            self._flows[steps] = self._compilation.core("flow", partial(self._flow, steps, ()), parts=[self._velocity])
-        flow = partial(self._flow, steps, changes) if changes else self._flows[steps]
+            whole = partial(self._flow, steps, (), None)
+            self._flows[steps] = self._compilation.core("flow", whole, parts=[self._velocity])
+        flow = partial(self._flow, steps, changes, given) if changes else self._flows[steps]
         with self.adapters.rows(fingerprints):
             return flow(encoded, seen, state, noise)
 
-    def _flow(self, steps: int, changes: Sequence[Change], encoded: Any, seen: Any, state: Any, noise: Any) -> Any:
+    def _flow(
+        self, steps: int, changes: Sequence[Change], given: Any, encoded: Any, seen: Any, state: Any, noise: Any
+    ) -> Any:
         """Return actions (B, H, D): without changes, whose values differ for each batch, all steps are one core."""
         float32 = require("torch").float32
 
         def velocity(actions: Any, time: float) -> Any:
-            times = actions.new_full((len(actions),), time, dtype=float32)
+            times = actions.new_full(actions.shape[: 2 if self.by_row else 1], time, dtype=float32)
+            if given is not None:
+                times = times * (1.0 - given[..., 0])
             return self._velocity(encoded, seen, state, actions, times)
 
         return follow(velocity, noise, steps, *changes)

@@ -53,6 +53,10 @@ class Wrapper(Agent, abc.ABC):
         """The contract of the inner agent, unless the wrapper changes it."""
         return self.agent.contract
 
+    @property
+    def continues_plans(self) -> bool:
+        return self.agent.continues_plans
+
     def shared_objects(self) -> list[Any]:
         return [*super().shared_objects(), *self.agent.shared_objects()]
 

@@ -2,14 +2,23 @@
 
 from __future__ import annotations
 
+import dataclasses
+import logging
+from pathlib import Path
+from typing import Any
+
 import numpy as np
 import pytest
+import torch
+from lerobot.policies.rtc import configuration_rtc
 
 from tests.families.lerobot import tiny
 from tests.families.lerobot.conftest import FILTERS, Load, Made, begun, view
 from vlagents_ray.errors import InvalidObservation
 from vlagents_ray.interface import DELAY, LEFTOVER
-from vlagents_ray.policies.lerobot import LeRobot
+from vlagents_ray.policies.lerobot import LeRobot, checkpoint
+from vlagents_ray.policies.lerobot.config import LeRobotConfig
+from vlagents_ray.policies.lerobot.kinds import LONGEST_PREFIX, SmolVLAPasses
 
 pytestmark = FILTERS
 
@@ -62,3 +71,51 @@ def test_the_settings_of_the_guidance_can_be_overridden(made: Made) -> None:
 def test_single_actions_do_not_go_on_from_a_plan(loaded: Load) -> None:
     assert not loaded("smolvla", actions="queue").continues_plans
     assert not loaded("act").continues_plans
+
+
+LONGEST, STEP = 3, 0.1  # rows of a prefix, and what the network below adds in each further row
+
+
+def _continue(self: Any, encoded: Any, seen: Any, state: Any, actions: Any, times: Any) -> Any:
+    """The velocity of a network that goes on from the last row at time 0; neither 0.4.4 nor 0.6.1 has one."""
+    given = times == 0
+    last = given.sum(1) - 1
+    start = actions[torch.arange(len(actions)), last.clamp(min=0)] * (last >= 0)[:, None]
+    behind = torch.arange(actions.shape[1])[None, :, None] - last[:, None, None]
+    return (actions - start[:, None] - STEP * behind) / times.clamp(min=1e-6)[..., None]
+
+
+@pytest.fixture
+def prefixed(made: Made, monkeypatch: pytest.MonkeyPatch) -> LeRobot:
+    """A policy whose checkpoint says that it was trained with prefixes, as those of LeRobot after 0.6.1 do."""
+
+    @dataclasses.dataclass
+    class Config(configuration_rtc.RTCConfig):  # type: ignore[misc]
+        mode: str = "guided"
+
+    def trained(folder: Path, config: LeRobotConfig) -> Any:
+        settings = read(folder, config)
+        setattr(settings, LONGEST_PREFIX, LONGEST)
+        return settings
+
+    read = checkpoint._settings
+    monkeypatch.setattr(checkpoint, "_settings", trained)
+    monkeypatch.setattr(configuration_rtc, "RTCConfig", Config)
+    monkeypatch.setattr(SmolVLAPasses, "velocity", _continue)
+    policy = LeRobot.from_config({"checkpoint": str(made("smolvla")), "execute": tiny.CHUNK})
+    policy.initialize()
+    return policy
+
+
+def test_a_checkpoint_trained_with_prefixes_is_given_them(prefixed: LeRobot, caplog: pytest.LogCaptureFixture) -> None:
+    plan = np.random.default_rng(5).uniform(-1, 1, (6, tiny.ACTION)).astype(np.float32)
+    delays = {0: LONGEST, 2: 2, 5: LONGEST}  # 0: not known yet
+    views = [view(0, **{LEFTOVER: plan, DELAY: delay}) for delay in delays]
+    with caplog.at_level(logging.WARNING):
+        acts = prefixed.act_batch([*views, view(0)], [begun(prefixed, i) for i in range(4)])
+    assert [record.levelname for record in caplog.records if LONGEST_PREFIX in record.message] == ["WARNING"]
+    scale = tiny.statistics()["action"]["std"]
+    for act, given in zip(acts, [*delays.values(), 0], strict=True):
+        assert not isinstance(act, Exception)
+        np.testing.assert_allclose(act.action[:given], plan[:given], atol=1e-5)
+        np.testing.assert_allclose(np.diff(act.action[max(given - 1, 0) :], axis=0) / scale, STEP, atol=1e-4)

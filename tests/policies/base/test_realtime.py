@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import pytest
 
 from vlagents_ray.policies.base.model_inputs import Row
-from vlagents_ray.policies.flow import Guide
+from vlagents_ray.policies.compilation import Compilation
+from vlagents_ray.policies.flow import FlowPasses, Guide
 
 HORIZON, DIM, STEPS = 8, 3, 10
 TARGET = 2.0  # of the model, for each number of each row
@@ -65,3 +68,66 @@ def test_few_steps_do_not_overshoot(steps: int) -> None:
 def test_a_delay_beyond_the_plan_and_a_plan_beyond_the_horizon_are_cut_to_it() -> None:
     np.testing.assert_allclose(flow(row(plan(2), 5))[0, :2], plan(2), atol=1e-6)
     np.testing.assert_allclose(flow(row(plan(20), 20))[0], plan(20)[:HORIZON], atol=1e-6)
+
+
+STEP = 0.25  # by which the policy below goes on in each row
+
+
+class Prefixed(FlowPasses):
+    """A policy that was trained with prefixes: its rows go on from the last one at time 0, by STEP each."""
+
+    def encode(self, tokens: Any, mask: Any, cameras: Any, state: Any, *images: Any) -> tuple[Any, Any]:
+        return state, mask
+
+    def velocity(self, encoded: Any, seen: Any, state: Any, actions: Any, times: Any) -> Any:
+        import torch
+
+        given = times == 0
+        last = given.sum(1) - 1
+        start = actions[torch.arange(len(actions)), last.clamp(min=0)] * (last >= 0)[:, None]
+        behind = torch.arange(HORIZON)[None, :, None] - last[:, None, None]
+        wanted = (actions - start[:, None] - STEP * behind) / times.clamp(min=1e-6)[..., None]
+        return torch.where(given[..., None], 100.0, wanted)  # of given rows, no velocity was ever trained
+
+
+def prefixed(*rows: Row) -> np.ndarray:
+    """(B, H, D) actions of `Prefixed`."""
+    import torch
+
+    passes = Prefixed(torch.nn.Identity(), Compilation(False))
+    passes.by_row = True
+    guide = Guide.of(rows, HORIZON, DIM)
+    assert guide is not None
+    guide = guide.to(torch.from_numpy)
+    noise = torch.from_numpy(np.stack([one.noise(HORIZON, DIM) for one in rows]))
+    there = torch.ones(len(rows), 1, dtype=torch.bool)
+    found = passes.sample(
+        [torch.zeros(len(rows), 3, 8, 8)],
+        [there[:, 0]],
+        torch.zeros(len(rows), 1, dtype=torch.long),
+        there,
+        noise=guide.given(noise),
+        owners=range(len(rows)),
+        steps=STEPS,
+        changes=[guide.keep],
+        given=guide.frozen,
+    )
+    return np.asarray(found)
+
+
+@pytest.mark.torch
+@pytest.mark.parametrize("delay", [1, 3, 6])
+def test_a_given_prefix_comes_back_unchanged_and_the_rest_continues_it(delay: int) -> None:
+    actions = prefixed(row(plan(), delay))[0]
+    np.testing.assert_array_equal(actions[:delay], plan()[:delay])
+    np.testing.assert_allclose(np.diff(actions[delay - 1 :], axis=0), STEP, atol=1e-5)
+
+
+@pytest.mark.torch
+def test_prefixes_of_other_lengths_in_a_batch_do_not_matter() -> None:
+    rows = [row(plan(), 2), row(), row(plan(3), 5)]
+    both = prefixed(*rows)
+    np.testing.assert_allclose(np.diff(both[1], axis=0), STEP, atol=1e-5)  # without a plan
+    for one, delay in ((0, 2), (2, 3)):
+        np.testing.assert_allclose(both[one], prefixed([row(plan(), 2), row(), row(plan(3), 5)][one])[0], atol=1e-6)
+        np.testing.assert_array_equal(both[one][:delay], plan(6 if one == 0 else 3)[:delay])

@@ -9,13 +9,12 @@ begin with (`vlagents_ray.chunking.buffer.ChunkBuffer`). A synchronous evaluatio
 from __future__ import annotations
 
 import math
-from collections import deque
 from collections.abc import Iterator
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from vlagents_ray.chunking.buffer import DELAYS, ChunkBuffer
+from vlagents_ray.chunking.buffer import ChunkBuffer, DelayEstimate
 from vlagents_ray.chunking.fallback import SafeAction, neutral, stopping
 from vlagents_ray.contract import Contract
 from vlagents_ray.errors import ConfigError
@@ -63,7 +62,7 @@ class ChunkExecutor:
             )
         self._plan = ChunkBuffer()
         self._last: np.ndarray | None = None  # (D,) action
-        self._delays: deque[int] = deque(maxlen=DELAYS)  # ticks that answers took
+        self._delay = DelayEstimate()
 
     def latency_s(self, measured_s: float) -> float | None:
         """Return the latency of an answer that took `measured_s`, s; None without a clock."""
@@ -73,7 +72,7 @@ class ChunkExecutor:
 
     def request_info(self) -> dict[str, Any]:
         """Return the `Obs.info` for real-time chunking: the remaining rows; {} if there are none or it is off."""
-        return self._plan.continuation(self._delays) if self._clock.real_time_chunking else {}
+        return self._plan.continuation(self._delay.ticks) if self._clock.real_time_chunking else {}
 
     def ticks(self, rows: np.ndarray, latency_s: float) -> Iterator[Tick]:
         """Return the ticks until the next request, after an answer of `rows`, (H, D), with `latency_s`.
@@ -90,7 +89,7 @@ class ChunkExecutor:
                 "request, so that nothing is left to continue; give an `execute` below that, and none in the policy"
             )
         wait = math.ceil(latency_s * self._hz - _EXACTLY)
-        self._delays.append(wait)
+        self._delay.add(wait)
         asked = self._plan.executed
         for tick in self._waiting(wait, rows.shape[1]):
             self._last = tick.action

@@ -16,7 +16,7 @@ from vlagents_ray.errors import ConfigError
 from vlagents_ray.policies.base.accelerator import ensure_torchvision
 from vlagents_ray.policies.base.checkpoint import SavedTensors, find_checkpoint, require_loaded
 from vlagents_ray.policies.lerobot.config import LeRobotConfig, is_new, other_version, refusal
-from vlagents_ray.policies.lerobot.kinds import KINDS, Diffusion, Flow
+from vlagents_ray.policies.lerobot.kinds import KINDS, LONGEST_PREFIX, Diffusion, Flow
 from vlagents_ray.policies.lerobot.processors import PIPELINES, require_known_steps
 from vlagents_ray.registry import require
 
@@ -126,7 +126,10 @@ def _prepare(settings: Any, config: LeRobotConfig, device: Any) -> bool:
         settings.compile_model = False
     if issubclass(KINDS.get(settings.type, object), Flow):
         rtc = settings.rtc_config or require("lerobot.policies.rtc.configuration_rtc").RTCConfig()
-        settings.rtc_config = dataclasses.replace(rtc, enabled=True, debug=False)
+        mode: dict[str, str] = {}
+        if getattr(settings, LONGEST_PREFIX, 0):  # in LeRobot's own rollouts a trained checkpoint is guided by default
+            mode["mode"] = (config.overrides.get("rtc_config") or {}).get("mode", "trained")
+        settings.rtc_config = dataclasses.replace(rtc, enabled=True, debug=False, **mode)
     choices = ["auto", "float32", *(["bfloat16"] if hasattr(settings, "dtype") else [])]
     if config.dtype not in choices:
         raise ConfigError(f"dtype: got {config.dtype!r}, LeRobot's {settings.type!r} takes one of {choices}")

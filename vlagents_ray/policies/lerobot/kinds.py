@@ -7,8 +7,10 @@ call its stateless functions, and pass them the state of each session.
 from __future__ import annotations
 
 import inspect
+import logging
 from collections.abc import Mapping, Sequence
 from contextlib import AbstractContextManager
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -21,9 +23,13 @@ from vlagents_ray.policies.base.accelerator import fetch
 from vlagents_ray.policies.base.model_inputs import GRIPPER
 from vlagents_ray.policies.base.staging import Staging
 from vlagents_ray.policies.compilation import Compilation
-from vlagents_ray.policies.flow import Change, FlowPasses, Pi0Passes, RandomSteps, cache_of, layers_of
+from vlagents_ray.policies.flow import Change, FlowPasses, Guide, Pi0Passes, RandomSteps, cache_of, layers_of
 from vlagents_ray.registry import require
 
+log = logging.getLogger(__name__)
+
+LONGEST_PREFIX = "rtc_training_max_delay"  # the config's field, of LeRobot after 0.6.1, for π0.5; 0: without prefixes
+_MEMORIES = ("use_visual_memory", "use_proprioceptive_memory")  # fields of π0.5's config in the same versions
 IMAGES = "observation.images"
 FRAMES = (
     "observation.state",
@@ -173,7 +179,10 @@ class MultiTaskDit(Kind):
 
 
 class Flow(Kind):
-    """SmolVLA, π0 and π0.5: flow matching from noise of the sessions, guided by their leftovers."""
+    """SmolVLA, π0 and π0.5: flow matching from noise of the sessions, guided by their leftovers.
+
+    A checkpoint that was trained with prefixes is given the first rows of a leftover instead, and no guidance.
+    """
 
     batched = True
     noise_level = 0.0  # as for `RandomSteps`
@@ -186,8 +195,18 @@ class Flow(Kind):
             self.passes: FlowPasses = SmolVLAPasses(model, compilation)
         else:
             self.passes = Pi0Passes(model, compilation, stated=policy.name == "pi0")
+        memories = [name for name in _MEMORIES if getattr(policy.config, name, False)]
+        if memories:
+            raise ConfigError(
+                f"checkpoint: has {memories}, want none: the policy object keeps them, so that sessions would mix"
+            )
+
         # The policy calls it after preparing the inputs and before converting the actions.
         model.sample_actions = self.passes.sample
+        trained = getattr(policy.rtc_processor.rtc_config, "mode", "guided") == "trained"
+        self.longest = int(getattr(policy.config, LONGEST_PREFIX)) if trained else 0  # rows of a prefix
+        self.passes.by_row = trained
+        self._told = False  # that a delay is longer
 
     @property
     def flow_steps(self) -> int:
@@ -205,9 +224,16 @@ class Flow(Kind):
         noise = convert(np.stack([row.noise(*shape) for row in rows]))
         self.random = RandomSteps.of(rows, (self.flow_steps, *shape), self.noise_level, convert)
         changes: list[Change] = []
+        given = None
         if any(left is not None for left in leftovers):
             plans = [None if left is None else self._encoded(left) for left in leftovers]
-            changes.append(self.guidance.towards(plans, [row.delay for row in rows], shape, convert))
+            prefixes = Guide.of(list(map(self._prefixed, rows, plans)), *shape) if self.longest else None
+            if prefixes is not None:
+                prefixes = prefixes.to(convert)
+                noise, given = prefixes.given(noise), prefixes.frozen
+                changes.append(prefixes.keep)
+            else:
+                changes.append(self.guidance.towards(plans, [row.delay for row in rows], shape, convert))
         if self.random is not None:
             changes.append(self.random.change)
         return self.policy.predict_action_chunk(
@@ -217,6 +243,7 @@ class Flow(Kind):
             fingerprints=[row.adapter for row in rows],
             steps=self.flow_steps,
             changes=changes,
+            given=given,
         )
 
     def _shared(self, rows: Sequence[Row]) -> tuple[list[int], list[int]]:
@@ -224,6 +251,20 @@ class Flow(Kind):
         if getattr(self.config, "use_relative_actions", False):  # each row's state is added to its actions
             return list(range(len(rows))), list(range(len(rows)))
         return shared_frames(rows)
+
+    def _prefixed(self, row: Row, plan: Any) -> Row:
+        """Return the row with its plan in the policy's units, and the number of its rows that are given."""
+        if row.delay > self.longest and not self._told:
+            self._told = True
+            log.warning(
+                "real-time chunking: got a delay of %d ticks, want at most %d, the checkpoint's %s, else chunks begin "
+                "with a jump; lower the latency or the control rate, or set overrides: {rtc_config: {mode: guided}}",
+                row.delay,
+                self.longest,
+                LONGEST_PREFIX,
+            )
+        delay = min(row.delay or self.longest, self.longest)  # before the first answer its delay is unknown
+        return replace(row, leftover=None if plan is None else fetch(plan), delay=delay)
 
     def _encoded(self, left: Any) -> Any:
         """Convert a leftover to the units of π0's ALOHA, if SmolVLA was trained in these."""

@@ -1,0 +1,132 @@
+"""The wrapper that makes a policy's relative actions absolute, by the state from which their chunk was computed."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import ClassVar
+
+import numpy as np
+from pydantic import BaseModel, Field
+
+from vlagents_ray.contract import Contract
+from vlagents_ray.errors import ConfigError, InvalidAction
+from vlagents_ray.interface import DISTRIBUTION, LEFTOVER, Act, Agent, Obs
+from vlagents_ray.policies.base import ModelPolicy
+from vlagents_ray.policies.base.model_inputs import leftover_plan, needs_gripper, state_specs, state_vector
+from vlagents_ray.policies.outcomes import attempt
+from vlagents_ray.policies.wrapper import Wrapper
+
+
+class AbsoluteActionsConfig(BaseModel, extra="forbid"):
+    """Settings of `AbsoluteActions`."""
+
+    state: list[str] = Field(
+        min_length=1,
+        description="parts of the proprioception to which actions are relative: in turn a number for each relative "
+        "column of an action",
+    )
+    absolute: list[int] = Field(
+        default=[], description="columns of an action that are absolute already, such as grippers; -1 is the last"
+    )
+
+
+class AbsoluteActions(Wrapper):
+    """Adds the state of an observation to all rows of the chunk that a policy computes from it.
+
+    Afterwards rows of several chunks have one meaning, however late each arrives: they can be merged, delayed and
+    continued. A leftover plan, which is absolute, is made relative to the state of the new observation. Policies of
+    LeRobot, openpi and GR00T do this by their checkpoints' own processors. The wrapper is for any other policy that was
+    trained with actions relative to the state at the beginning of a chunk; not for actions that are each relative to
+    the pose before, such as LIBERO's.
+
+    Args:
+        agent: The policy, with whole chunks of relative actions that add up with states: joints or positions.
+        config: The settings.
+
+    Raises:
+        ConfigError: The policy returns rows of earlier chunks, or its actions are of another kind.
+    """
+
+    Config: ClassVar[type] = AbsoluteActionsConfig
+    config: AbsoluteActionsConfig
+
+    def __init__(self, agent: Agent, config: AbsoluteActionsConfig) -> None:
+        super().__init__(agent, config)
+        while isinstance(agent, Wrapper):
+            agent = agent.agent
+        if isinstance(agent, ModelPolicy) and agent.config.actions != "chunk":
+            raise ConfigError(
+                f"absolute_actions: got a policy with actions: {agent.config.actions}, whose rows belong to chunks of "
+                f"earlier states; want actions: chunk, and let the chunk player or the evaluation execute them"
+            )
+
+    @property
+    def contract(self) -> Contract | None:
+        """The contract of the policy, with absolute actions and the parts of the state that they need."""
+        inner, parts = self.agent.contract, self.config.state
+        if inner is None:
+            return None
+        dim = inner.action.dim
+        state = state_specs(parts, None if dim is None else dim - len(self.config.absolute))
+        return replace(
+            inner,
+            state=state | dict(inner.state or {}),
+            gripper=needs_gripper(parts) or inner.gripper,
+            action=replace(inner.action, delta=False),
+        )
+
+    def initialize(self) -> None:
+        """Initialize the policy; raises `ConfigError` if its actions are not relative to a state."""
+        super().initialize()
+        inner = self.agent.contract
+        if inner is None:
+            return
+        action = inner.action
+        got = {
+            "absolute actions": action.delta is False,
+            f"actions in the space {action.space!r}": "velocity" in (action.space or ""),
+            f"rotations as {action.rotation!r}": action.rotation not in (None, "none"),
+        }
+        if wrong := [what for what, is_so in got.items() if is_so]:
+            raise ConfigError(
+                f"absolute_actions: the policy has {' and '.join(wrong)}, want relative ones that add up with its "
+                f"state, such as joints; leave the wrapper out"
+            )
+
+    def begin(self, obs: Obs, instruction: str | None) -> Obs:
+        return obs
+
+    def change_batch(self, obs: Sequence[Obs], sessions: Sequence[Wrapper]) -> list[Obs | Exception]:
+        return [attempt(self._with_relative_plan, one) for one in obs]
+
+    def act_batch(self, obs: Sequence[Obs], sessions: Sequence[Agent]) -> list[Act | Exception]:
+        acts = super().act_batch(obs, sessions)
+        return [
+            act if isinstance(act, Exception) else attempt(self._absolute, one, act)
+            for one, act in zip(obs, acts, strict=True)
+        ]
+
+    def _with_relative_plan(self, obs: Obs) -> Obs:
+        if obs.info.get(LEFTOVER) is None:
+            return obs
+        plan = leftover_plan(obs, self.agent.contract)
+        return replace(obs, info={**obs.info, LEFTOVER: plan - self._origin(obs, plan.shape[-1])})
+
+    def _absolute(self, obs: Obs, act: Act) -> Act:
+        origin, info = self._origin(obs, act.action.shape[-1]), act.info
+        if DISTRIBUTION in info:
+            drawn = info[DISTRIBUTION]
+            moved = {name: drawn[name] + origin for name in ("mean", "samples") if name in drawn}
+            info = {**info, DISTRIBUTION: {**drawn, **moved}}
+        return Act(act.action + origin, act.done, info)
+
+    def _origin(self, obs: Obs, dim: int) -> np.ndarray:
+        """Return the pose to which actions are relative, (dim,) float32; zeros in absolute columns."""
+        if outside := [column for column in self.config.absolute if not -dim <= column < dim]:
+            raise InvalidAction(f"absolute_actions: got the absolute columns {outside} of actions with {dim} numbers")
+        relative = np.ones(dim, bool)
+        relative[self.config.absolute] = False
+        origin = np.zeros(dim, np.float32)
+        origin[relative] = state_vector(obs, self.config.state, int(relative.sum()))
+        return origin
