@@ -10,19 +10,19 @@ from pathlib import Path
 
 import numpy as np
 import typer
-from PIL import Image
+from PIL import Image, ImageDraw, ImageFont
 
 from vlagents_ray import Act
 from vlagents_ray.envs import make_env
 from vlagents_ray.policies.reference import Reference
 
 FOLDER = Path(__file__).parent
-SIDE, EVERY, FRAME_MS, PAUSE = 200, 2, 60, 12  # px; of the steps; ms; frames for which the end is shown
-EPISODES = {"pick_place": 3, "slide": 3, "stack": 3, "lift": 3}  # task: seed
+SIDE, LINE, FRAME_MS, PAUSE = 200, 22, 80, 15  # px; px of the instruction; ms; frames for which the end is shown
+EPISODES = {"pick_place": 3, "slide": 5, "stack": 7, "lift": 11}  # task: seed
 
 
-def played(agent: Reference, task: str, seed: int) -> list[np.ndarray]:
-    """Return the front camera's pictures of an episode, (SIDE, SIDE, 3) uint8, until it is solved or over."""
+def played(agent: Reference, task: str, seed: int) -> list[Image.Image]:
+    """Return the front camera's pictures of an episode until it is solved or over, above its instruction."""
     shown, frames = make_env(f"tabletop/{task}", width=SIDE, height=SIDE), []
     with make_env(f"tabletop/{task}", cameras=["front", "wrist"], width=64, height=64) as env, shown:
         obs, _ = env.reset(seed=seed)
@@ -35,8 +35,17 @@ def played(agent: Reference, task: str, seed: int) -> list[np.ndarray]:
                 frames.append(shown.step(Act(row))[0].cameras["front"])
                 if over := terminated or truncated or info["success"]:
                     break
-        typer.echo(f"{task}, seed {seed}: {env.instruction!r}, {len(frames)} steps, solved: {info['success']}")
-    return frames[::EVERY] + [frames[-1]] * PAUSE
+        words = env.instruction
+        typer.echo(f"{task}, seed {seed}: {words!r}, {len(frames)} steps, solved: {info['success']}")
+    return [with_words(frame, words) for frame in frames + [frames[-1]] * PAUSE]
+
+
+def with_words(frame: np.ndarray, words: str) -> Image.Image:
+    """Return a picture (SIDE, SIDE, 3) uint8 above words."""
+    picture = Image.new("RGB", (SIDE, SIDE + LINE), "#37393d")
+    picture.paste(Image.fromarray(frame))
+    ImageDraw.Draw(picture).text((SIDE / 2, SIDE + LINE / 2), words, "white", ImageFont.load_default(9), "mm")
+    return picture
 
 
 def main() -> None:
@@ -47,7 +56,7 @@ def main() -> None:
     length = max(map(len, clips))
     clips = [clip + [clip[-1]] * (length - len(clip)) for clip in clips]
     pictures = [Image.fromarray(np.concatenate(row, 1)) for row in zip(*clips, strict=True)]
-    palette = pictures[0].quantize(64)
+    palette = Image.fromarray(np.concatenate(pictures[::8])).quantize(128, Image.Quantize.MAXCOVERAGE, kmeans=3)
     first, *rest = [picture.quantize(palette=palette, dither=Image.Dither.NONE) for picture in pictures]
     first.save(FOLDER / "demo.gif", save_all=True, append_images=rest, duration=FRAME_MS, loop=0, optimize=True)
 
