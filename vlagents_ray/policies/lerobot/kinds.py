@@ -7,7 +7,6 @@ call its stateless functions, and pass them the state of each session.
 from __future__ import annotations
 
 import inspect
-import logging
 from collections.abc import Mapping, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import replace
@@ -26,8 +25,6 @@ from vlagents_ray.policies.compilation import Compilation
 from vlagents_ray.policies.flow import Change, FlowPasses, Guide, Pi0Passes, RandomSteps, cache_of, layers_of
 from vlagents_ray.registry import require
 
-log = logging.getLogger(__name__)
-
 LONGEST_PREFIX = "rtc_training_max_delay"  # the config's field, of LeRobot after 0.6.1, for π0.5; 0: without prefixes
 _MEMORIES = ("use_visual_memory", "use_proprioceptive_memory")  # fields of π0.5's config in the same versions
 IMAGES = "observation.images"
@@ -43,6 +40,7 @@ class Kind:
 
     batched = False
     random: RandomSteps | None = None  # of the last sampled chunks
+    given: Mapping[int, int] = {}  # number of rows that the last sampled chunks were given, by the row of the batch
 
     def __init__(self, policy: Any, compilation: Compilation) -> None:
         """Use a loaded policy, and mark its core functions for compilation if its type has any."""
@@ -206,7 +204,6 @@ class Flow(Kind):
         trained = getattr(policy.rtc_processor.rtc_config, "mode", "guided") == "trained"
         self.longest = int(getattr(policy.config, LONGEST_PREFIX)) if trained else 0  # rows of a prefix
         self.passes.by_row = trained
-        self._told = False  # that a delay is longer
 
     @property
     def flow_steps(self) -> int:
@@ -224,11 +221,12 @@ class Flow(Kind):
         noise = convert(np.stack([row.noise(*shape) for row in rows]))
         self.random = RandomSteps.of(rows, (self.flow_steps, *shape), self.noise_level, convert)
         changes: list[Change] = []
-        given = None
+        given, self.given = None, {}
         if any(left is not None for left in leftovers):
             plans = [None if left is None else self._encoded(left) for left in leftovers]
             prefixes = Guide.of(list(map(self._prefixed, rows, plans)), *shape) if self.longest else None
             if prefixes is not None:
+                self.given = {i: int(prefixes.frozen[i].sum()) for i, plan in enumerate(plans) if plan is not None}
                 prefixes = prefixes.to(convert)
                 noise, given = prefixes.given(noise), prefixes.frozen
                 changes.append(prefixes.keep)
@@ -254,15 +252,6 @@ class Flow(Kind):
 
     def _prefixed(self, row: Row, plan: Any) -> Row:
         """Return the row with its plan in the policy's units, and the number of its rows that are given."""
-        if row.delay > self.longest and not self._told:
-            self._told = True
-            log.warning(
-                "real-time chunking: got a delay of %d ticks, want at most %d, the checkpoint's %s, else chunks begin "
-                "with a jump; lower the latency or the control rate, or set overrides: {rtc_config: {mode: guided}}",
-                row.delay,
-                self.longest,
-                LONGEST_PREFIX,
-            )
         delay = min(row.delay or self.longest, self.longest)  # before the first answer its delay is unknown
         return replace(row, leftover=None if plan is None else fetch(plan), delay=delay)
 

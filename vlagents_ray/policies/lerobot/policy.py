@@ -13,7 +13,7 @@ import numpy as np
 from vlagents_ray.contract import ActionSpec, CameraSpec, Contract
 from vlagents_ray.dataset_contract import DatasetContract, angles_in, centre_between, usual_unit
 from vlagents_ray.errors import ConfigError
-from vlagents_ray.interface import Obs
+from vlagents_ray.interface import GIVEN, Obs
 from vlagents_ray.policies.base import ModelPolicy, Prediction, Row, model_inputs
 from vlagents_ray.policies.base.accelerator import torch_device
 from vlagents_ray.policies.base.model_code import remote_code
@@ -201,7 +201,8 @@ class LeRobot(ModelPolicy):
                     chunks[places] = own.actions(drawn[places])
             dim = settings.action_feature.shape[0]
             stated = {} if kind.random is None else kind.random.stated(self.config.execute, dim)
-        return [Prediction(chunk, behaviour=stated.get(i, {})) for i, chunk in enumerate(chunks)]
+        given = [{GIVEN: kind.given[i]} if i in kind.given else {} for i in range(len(rows))]
+        return [Prediction(chunk, behaviour=stated.get(i, {}), info=given[i]) for i, chunk in enumerate(chunks)]
 
 
 def _of(adapter: str, rows: Sequence[Row]) -> list[int]:
