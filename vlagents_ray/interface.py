@@ -128,8 +128,9 @@ class Agent:
     statistics: dict[str, Any] | None = None
     """Optional: ranges of the training's numbers as in LeRobot's `stats.json`, {"action": {"min": …, "max": …}, …}.
 
-    "parts" names the parts of the state in their order. A server's metadata have them among the `weights`, and
-    `vlagents-ray robot` compares them with the robot before its first motion.
+    They are in the robot's units; None stands for a number that is not known. "parts" names the parts of the state in
+    their order. A server's metadata have them among the `weights`, and `vlagents-ray robot` compares them with the
+    robot before its first motion.
     """
 
     check: Callable[[np.ndarray, np.ndarray | None], np.ndarray] | None = None

@@ -47,6 +47,7 @@ class Embodiment:
     moments: Mapping[str, tuple[int, ...]]  # of "video" and "state": offsets of the observations read, 0 for the newest
     horizon: int  # rows of a chunk
     spec: ActionSpec
+    ranges: Mapping[str, Any]  # of "state" and "action", by group, in the robot's units
 
     @property
     def history(self) -> int:
@@ -96,6 +97,10 @@ class Embodiment:
                 sum(widths["action"].values()),
                 converted=bool(settings.get("use_relative_action")),
             ),
+            {
+                kind: {group: {name: numbers[kind][group][name] for name in names} for group in groups}
+                for kind, groups in widths.items()
+            },
         )
 
     def require_fits(self, config: Any) -> None:
@@ -471,6 +476,7 @@ class Gr00t(ModelPolicy):
         """Read the checkpoint; raises `ConfigError` for settings that do not fit it."""
         network = Gr00tNetwork.load(self.config)
         self._cameras(network.embodiment)
+        self.statistics = {"parts": list(self._parts(network.embodiment)), **network.embodiment.ranges}
         compile_with(network.model.action_head.model, self.config.spare_tokens, self.compilation)
         return network
 

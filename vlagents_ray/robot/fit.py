@@ -66,10 +66,11 @@ class Trained:
         return cls(state, action, tuple(stated["parts"]) if "parts" in stated else None)
 
     def vector(self, obs: Obs, parts: Sequence[str]) -> np.ndarray | None:
-        """Return the state in the order of the training, else of `parts`, (D,); None if it has none of them."""
-        have = {**obs.state, **({} if obs.gripper is None else {"gripper": np.array([obs.gripper])})}
-        named = [have[part] for part in (parts if self.parts is None else self.parts) if part in have]
-        return np.concatenate(named) if named else None
+        """Return the state in the order of the training, else of `parts`, (D,); None if it lacks one of them."""
+        have, wanted = dict(obs.state), parts if self.parts is None else self.parts
+        if obs.gripper is not None:
+            have |= {"gripper": np.array([obs.gripper]), "gripper_closed": np.array([1 - obs.gripper])}
+        return np.concatenate([have[part] for part in wanted]) if wanted and have.keys() >= set(wanted) else None
 
     def misfits(
         self, state: np.ndarray | None, chunk: np.ndarray | None, limits: Limits | None, names: Sequence[str] = ()
