@@ -28,7 +28,7 @@ from vlagents_ray.errors import ConfigError, VLAgentsError
 from vlagents_ray.interface import Agent
 from vlagents_ray.robot.fit import Trained, require_fit
 from vlagents_ray.robot.limits import Limits
-from vlagents_ray.robot.loop import LoopReport, Restart, Robot, import_class, robot_named, run_loop
+from vlagents_ray.robot.loop import LoopReport, Restart, Robot, contract_of, import_class, robot_named, run_loop
 from vlagents_ray.robot.record import Recorder
 from vlagents_ray.robot.ros import RosRobot, read_settings
 from vlagents_ray.robot.safety import SOFT_START_S, Guard, Watchdog, measured_state
@@ -147,7 +147,7 @@ def _run(options: argparse.Namespace) -> LoopReport:
         robot: Robot = topics or (SimulatedRobot(contract) if make_robot is None else make_robot())
         stack.callback(getattr(robot, "close", lambda: None))
         if topics is not None or make_robot is not None or options.trained_on is not None:
-            require_match(contract, getattr(robot, "contract", None))
+            require_match(contract, contract_of(robot))
             _require_fit(options, agent, robot, guard.limits, say)
         recorder = None
         if options.record:

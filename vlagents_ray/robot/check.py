@@ -12,11 +12,11 @@ from typing import Any
 
 import numpy as np
 
-from vlagents_ray.contract import ActionSpec, Contract, StateSpec
+from vlagents_ray.contract import ActionSpec, Contract, StateSpec, reordered
 from vlagents_ray.errors import ConfigError, InvalidObservation
 from vlagents_ray.images.jpeg_png import encode_jpeg
 from vlagents_ray.interface import CAPTURED, Obs
-from vlagents_ray.robot.loop import Robot
+from vlagents_ray.robot.loop import Robot, contract_of
 from vlagents_ray.validation import check_observation
 
 CHECKS = {  # in the order in which they run
@@ -166,7 +166,7 @@ def examine(
     Returns:
         The findings, and which checks passed or were not made.
     """
-    contract = contract or getattr(robot, "contract", None) or Contract()
+    contract = contract or contract_of(robot)
     suite = _Suite(robot, contract, operator, 1 / (hz or contract.control_hz or 50.0), latency_s, clock)
     try:
         suite.at_rest()
@@ -218,6 +218,10 @@ class _Suite:
         self._layout = _Layout.find(self._robot, self._contract, first)
         check_observation(first, self._contract)
         self._passes("observation")
+        names = getattr(self._robot, "joint_names", ())
+        for number, ours, theirs in reordered(names, self._contract.action.names or ())[:1]:
+            cure = "give actions and state the contract's order of joints"
+            self.find("order", f"{ours!r} as joint {number} of the arm", f"{theirs!r}, as the contract states", cure)
         for _ in range(20):
             self._clock.sleep(self._period_s)
             last = self._observe()

@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 
+from vlagents_ray.contract import reordered
 from vlagents_ray.errors import ConfigError, ContractMismatch
 from vlagents_ray.interface import Obs
 from vlagents_ray.robot.limits import Limits
@@ -83,13 +84,12 @@ class Trained:
             limits: The limits of the arm.
             names: The names of the numbers by the arm's driver; default: those of `limits`.
         """
-        stated = [] if limits is None else [one.removesuffix(".pos") for one in limits.joints]
-        found, names = [], [one.removesuffix(".pos") for one in names] or stated
-        for number, (ours, theirs) in enumerate(zip(names, stated, strict=False)):
-            if ours != theirs and ours in stated:
-                found.append(
-                    f"joints: number {number} is {ours!r} of the arm and {theirs!r} of its limits; use one order"
-                )
+        stated = () if limits is None else limits.joints
+        found = [
+            f"joints: number {number} is {ours!r} of the arm and {theirs!r} of its limits; use one order"
+            for number, ours, theirs in reordered(names, stated)
+        ]
+        names = [one.removesuffix(".pos") for one in names or stated]
         if self.state is not None and state is not None:
             found += _outside("state", state[np.newaxis], *self.state, names)
         if self.action is not None and chunk is not None:

@@ -124,6 +124,9 @@ class LeRobot(ModelPolicy):
         environment = list(trained.environment or [ENVIRONMENT_STATE]) if settings.env_state_feature else []
         width = processors.width(kind.dim)
         action, known = trained.contract.action, trained.contract.state or {}
+        action = action if action.dim == width else ActionSpec(dim=width)
+        if len(names := getattr(settings, "action_feature_names", None) or ()) == width:
+            action = replace(action, names=tuple(names))
         state = model_inputs.state_specs(parts, settings.robot_state_feature.shape[0]) if parts else {}
         if tuple(parts) == trained.state:
             state |= known
@@ -133,7 +136,7 @@ class LeRobot(ModelPolicy):
             state=state | {part: known.get(part, spec) for part, spec in around.items()},
             gripper=model_inputs.needs_gripper(parts),
             instruction=processors.instructed or None,
-            action=action if action.dim == width else ActionSpec(dim=width),
+            action=action,
             control_hz=trained.contract.control_hz,
             chunk=self.chunk(kind.horizon),
             history=kind.steps,

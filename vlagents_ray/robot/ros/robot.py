@@ -346,6 +346,11 @@ class RosRobot:
         return limits
 
     @property
+    def joint_names(self) -> list[str]:
+        """The joints in the order of an action, as far as the settings of its topics name them."""
+        return [name for topic in self.settings.actions for name in topic.names]
+
+    @property
     def contract(self) -> Contract:
         """The contract of the topics, from the messages received so far."""
         cameras = {name: self._value(one) for name, one in self.settings.cameras.items()}
