@@ -219,10 +219,9 @@ def _action_differences(policy: ActionSpec, env: ActionSpec) -> Iterator[str]:
 
 
 def reordered(ours: Sequence[str], theirs: Sequence[str]) -> list[tuple[int, str, str]]:
-    """Compare the order of the joints that both lists name; LeRobot's suffix ".pos" does not count.
+    """Return where two lists have the joints that both name in another order: (number, ours, theirs).
 
-    Returns:
-        For each difference the number of our joint, its name, and the name that they have in its place.
+    LeRobot's suffix ".pos" does not count.
     """
     mine, others = ([name.removesuffix(".pos") for name in names] for names in (ours, theirs))
     pairs = zip((one for one in mine if one in others), (one for one in others if one in mine), strict=False)

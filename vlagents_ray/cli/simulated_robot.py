@@ -103,13 +103,8 @@ class RobotRun:
             env = stack.enter_context(make_env(self.options.env, **self._env_options))
             hz = self.options.hz or env.contract.control_hz or _HZ
             leader = self._leader(env.contract, stack)
-            guard = Guard(
-                env.contract,
-                max_step=self.options.max_step,
-                limits=self.options.limits,
-                hz=hz,
-                soft_start_s=self.options.soft_start_s,
-            )
+            motion = {name: getattr(self.options, name) for name in ("max_step", "limits", "soft_start_s")}
+            guard = Guard(env.contract, hz=hz, **motion)
             agent = stack.enter_context(self._agent(env.contract, leader, guard))
             self._control = agent.control
             if self.options.record is not None:

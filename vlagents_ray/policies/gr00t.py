@@ -47,7 +47,7 @@ class Embodiment:
     moments: Mapping[str, tuple[int, ...]]  # of "video" and "state": offsets of the observations read, 0 for the newest
     horizon: int  # rows of a chunk
     spec: ActionSpec
-    ranges: Mapping[str, Any]  # of "state" and "action", by group, in the robot's units
+    ranges: Mapping[str, Any]  # of the training: "state" and "action", by group, in the robot's units
 
     @property
     def history(self) -> int:
@@ -81,10 +81,11 @@ class Embodiment:
             )
         config, numbers = configs[chosen], statistics[chosen]
         names = ("q01", "q99") if settings.get("use_percentiles") else ("min", "max")
-        widths = {
-            kind: {group: _width(folder, numbers, kind, group, names) for group in config[kind]["modality_keys"]}
+        ranges = {
+            kind: {group: _range(folder, numbers, kind, group, names) for group in config[kind]["modality_keys"]}
             for kind in ("state", "action")
         }
+        widths = {kind: {group: len(one[names[0]]) for group, one in groups.items()} for kind, groups in ranges.items()}
         return cls(
             chosen,
             tuple(config["video"]["modality_keys"]),
@@ -97,10 +98,7 @@ class Embodiment:
                 sum(widths["action"].values()),
                 converted=bool(settings.get("use_relative_action")),
             ),
-            {
-                kind: {group: {name: numbers[kind][group][name] for name in names} for group in groups}
-                for kind, groups in widths.items()
-            },
+            ranges,
         )
 
     def require_fits(self, config: Any) -> None:
@@ -117,8 +115,8 @@ class Embodiment:
                 )
 
 
-def _width(folder: Path, numbers: Mapping[str, Any], kind: str, group: str, names: tuple[str, str]) -> int:
-    """Return the width of a group of the state or of actions, whose bounds are finite."""
+def _range(folder: Path, numbers: Mapping[str, Any], kind: str, group: str, names: tuple[str, str]) -> dict[str, Any]:
+    """Return the bounds of a group of the state or of actions, which are finite."""
     bounds = [np.asarray(numbers.get(kind, {}).get(group, {}).get(name, ()), np.float64) for name in names]
     if bounds[0].ndim != 1 or not bounds[0].size or bounds[0].shape != bounds[1].shape:
         raise ConfigError(
@@ -127,7 +125,7 @@ def _width(folder: Path, numbers: Mapping[str, Any], kind: str, group: str, name
         )
     if not np.isfinite(bounds).all():
         raise ConfigError(f"checkpoint {folder}: {list(names)} of {kind} {group!r} are not all finite; {_CURE}")
-    return int(bounds[0].size)
+    return dict(zip(names, (bound.tolist() for bound in bounds), strict=True))
 
 
 def _action(groups: Any, dim: int, *, converted: bool) -> ActionSpec:

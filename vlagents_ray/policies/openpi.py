@@ -135,13 +135,13 @@ class Transforms:
         except ValueError as error:
             raise ConfigError(f"checkpoint {folder}: {error}; compute its statistics with openpi's script") from error
         robot, model = data.data_transforms, data.model_transforms
-        ends = [{name: getattr(one, end) for name, one in statistics.items()} for end in _ENDS]
-        known = all(end is not None for one in ends for end in one.values())
+        known = all(getattr(one, end) is not None for one in statistics.values() for end in _ENDS)
+        ends = [{name: getattr(one, end) for name, one in statistics.items()} for end in _ENDS if known]
         return cls(
             openpi.compose([*robot.inputs, normalise, *model.inputs]),
             openpi.compose([*model.outputs, restore, *robot.outputs]),
             openpi.compose([*robot.inputs, normalise]),
-            [normalise(one) for one in ends] if known else [],
+            [normalise(one) for one in ends],
             type(robot.inputs[0]).__name__ if robot.inputs else "",
             not any(
                 getattr(one, "prompt", None) for one in model.inputs if isinstance(one, openpi.InjectDefaultPrompt)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import base64
 import html
 import time
 from concurrent.futures import ThreadPoolExecutor
@@ -14,7 +13,7 @@ import numpy as np
 
 from vlagents_ray.contract import ActionSpec, Contract, StateSpec, reordered
 from vlagents_ray.errors import ConfigError, InvalidObservation
-from vlagents_ray.images.jpeg_png import encode_jpeg
+from vlagents_ray.images.jpeg_png import data_url, encode_jpeg
 from vlagents_ray.interface import CAPTURED, Obs
 from vlagents_ray.robot.loop import Robot, contract_of
 from vlagents_ray.validation import check_observation
@@ -130,15 +129,13 @@ class RobotReport:
 
     def write(self, file: str | Path) -> None:
         """Write the report with its pictures as one HTML page, which needs no network."""
-        lines = "".join(f"<li>{html.escape(line)}</li>" for line in self.lines())
-        pictures = "".join(
-            f'<figure><img src="data:image/jpeg;base64,{base64.b64encode(encode_jpeg(picture)).decode()}">'
-            f"<figcaption>{html.escape(title)}</figcaption></figure>"
-            for title, picture in self.pictures.items()
-        )
         style = "body{font-family:sans-serif}figure{display:inline-block;margin:8px}img{height:240px}"
         page = f"<!doctype html><meta charset=utf-8><title>Check of a robot</title><style>{style}</style>"
-        Path(file).write_text(f"{page}<h1>Check of a robot</h1><ul>{lines}</ul>{pictures}", encoding="utf-8")
+        page += f"<h1>Check of a robot</h1><ul>{''.join(f'<li>{html.escape(line)}</li>' for line in self.lines())}</ul>"
+        for title, picture in self.pictures.items():
+            url = data_url("image/jpeg", encode_jpeg(picture))
+            page += f'<figure><img src="{url}"><figcaption>{html.escape(title)}</figcaption></figure>'
+        Path(file).write_text(page, encoding="utf-8")
 
 
 def examine(
@@ -177,8 +174,7 @@ def examine(
         suite.find("observation", str(error), "an observation that fits the contract", "correct observe", ends=False)
     finally:
         robot.stop()
-    found = {finding.check for finding in suite.report.findings}
-    suite.skip_others("an earlier check found something" if found else "nothing moved")
+    suite.skip_others("an earlier check found something" if suite.report.findings else "nothing moved")
     return suite.report
 
 
