@@ -135,15 +135,9 @@ def _action(groups: Any, dim: int, *, converted: bool) -> ActionSpec:
     GR00T converts relative groups to absolute ones if the processor has `use_relative_action`.
     """
     stated = [group for group in groups if converted and group["rep"] in _CONVERTED]
-    deltas = {_CONVERTED[group["rep"]] for group in stated}
-    spaces = {_SPACES.get(group["type"]) for group in stated}
-    rotations = {_ROTATIONS.get(group["format"]) for group in stated}
-    return ActionSpec(
-        dim=dim,
-        delta=deltas.pop() if len(deltas) == 1 else None,
-        space=spaces.pop() if len(spaces) == 1 else None,
-        rotation=rotations.pop() if len(rotations) == 1 else None,  # type: ignore[arg-type]
-    )
+    tables = {"delta": (_CONVERTED, "rep"), "space": (_SPACES, "type"), "rotation": (_ROTATIONS, "format")}
+    found = {name: {table.get(group[key]) for group in stated} for name, (table, key) in tables.items()}
+    return ActionSpec(dim=dim, **{name: one.pop() for name, one in found.items() if len(one) == 1})
 
 
 class Gr00tConfig(ModelConfig):

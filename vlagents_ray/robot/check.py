@@ -397,7 +397,7 @@ class _Suite:
 
     def _hold_command(self, layout: _Layout, obs: Obs) -> np.ndarray:
         """Return the action that should move nothing."""
-        action = np.zeros(layout.dim)
+        action = np.zeros(len(layout.joints) + len(layout.grippers))
         if not layout.relative:
             action[layout.joints] = layout.measured(obs)
         spec = self._contract.action
@@ -539,19 +539,22 @@ class _Suite:
         if not self._agreed("closing and opening the gripper"):
             return
         action = self._hold_command(layout, obs)
-        openings = []
-        for goal in (spec.gripper_open, spec.gripper_closed, spec.gripper_open):
+
+        def opening(goal: float | None) -> float:
             action[layout.grippers] = goal
             self._apply(action)
             self._clock.sleep(2.0)
-            openings.append(self._observe().gripper or 0.0)
-            saw = self._operator.saw_closing() if self._operator is not None and goal == spec.gripper_closed else None
-            if len(openings) == 2 and saw is None:
-                self.report.skipped["gripper"] = "the operator could not tell whether it closed"
-            if len(openings) == 2 and (openings[1] > openings[0] - 0.3 or saw is False):
-                got = f"an opening of {openings[0]:.2g} before and {openings[1]:.2g} after the command to close"
-                cure = "exchange gripper_open and gripper_closed of the contract, and give 1 for open in observe"
-                self.find("gripper", got, "a gripper that closes, and a smaller opening", cure)
+            return self._observe().gripper or 0.0
+
+        before, after = opening(spec.gripper_open), opening(spec.gripper_closed)
+        saw = None if self._operator is None else self._operator.saw_closing()
+        if saw is None:
+            self.report.skipped["gripper"] = "the operator could not tell whether it closed"
+        if after > before - 0.3 or saw is False:
+            got = f"an opening of {before:.2g} before and {after:.2g} after the command to close"
+            cure = "exchange gripper_open and gripper_closed of the contract, and give 1 for open in observe"
+            self.find("gripper", got, "a gripper that closes, and a smaller opening", cure)
+        opening(spec.gripper_open)
         self._passes("gripper")
 
 
@@ -559,7 +562,6 @@ class _Suite:
 class _Layout:
     """The numbers of an action, and the parts of the state that measure them."""
 
-    dim: int
     names: list[str]  # of the joints
     limits: np.ndarray  # (D, 2), of the joints; infinite if the robot has no `joint_limits`
     joints: list[int]  # their numbers in an action
@@ -580,15 +582,10 @@ class _Layout:
         each = (action.dim - sum(counts)) // max(1, len(parts))
         if not parts or each not in (0, 1) or sum(counts) + each * len(parts) != action.dim:
             return None
-        joints: list[int] = []
-        grippers: list[int] = []
-        poses: list[str | None] = []
-        for part, count in zip(parts, counts, strict=True):
-            at = len(joints) + len(grippers)
-            joints += range(at, at + count)
-            grippers += range(at + count, at + count + each)
-            pose = part.replace("joints", "tquat")
-            poses += [pose if pose in obs.state else None] * count
+        grippers = [int(end) - 1 for end in np.cumsum(counts) + each * np.arange(1, len(parts) + 1)] if each else []
+        joints = [number for number in range(action.dim) if number not in grippers]
+        hands = [pose if (pose := part.replace("joints", "tquat")) in obs.state else None for part in parts]
+        poses = [hand for hand, count in zip(hands, counts, strict=True) for _ in range(count)]
         names = list(getattr(robot, "joint_names", ()))
         if len(names) != len(joints):
             names = [f"joint {number}" for number in range(len(joints))]
@@ -596,7 +593,7 @@ class _Layout:
         if limits.shape != (len(joints), 2):
             raise ConfigError(f"joint_limits: got {limits.shape}, want ({len(joints)}, 2), a low and a high for each")
         unit = ((contract.state or {}).get(parts[0]) or StateSpec()).unit or "rad"
-        return cls(action.dim, names, limits, joints, grippers, parts, poses, unit, bool(action.relative))
+        return cls(names, limits, joints, grippers, parts, poses, unit, bool(action.relative))
 
     @property
     def step(self) -> float:

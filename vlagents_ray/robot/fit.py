@@ -95,27 +95,19 @@ class Trained:
         if self.action is not None and chunk is not None:
             found += _outside("first chunk", chunk, *self.action, names)
         if limits is not None and self.action is not None:
-            for bound, trained, sign in ((limits.low, self.action[0], -1), (limits.high, self.action[1], 1)):
-                if bound is None or np.shape(bound) not in ((), trained.shape):
-                    continue
-                for i in np.flatnonzero(sign * (trained - np.asarray(bound, np.float64)) > 0):
-                    limit = np.broadcast_to(bound, trained.shape)[i]
+            for limit, trained, sign in zip(limits.bounds(len(self.action[0])), self.action, (-1, 1), strict=True):
+                for i in np.flatnonzero(sign * (trained - limit) > 0):
                     found.append(
                         f"action{_name(int(i), names)}: was trained to {trained[i]:.4g}, the arm's limit is "
-                        f"{limit:.4g}; are they of another arm, or in another order?"
+                        f"{limit[i]:.4g}; are they of another arm, or in another order?"
                     )
         return found
 
     def drawn(self, chunk: np.ndarray, limits: Limits | None, names: Sequence[str] = ()) -> list[str]:
         """Draw the first chunk, (H, D), beside the training's actions and the limits: a line for each number."""
         dim = chunk.shape[1]
-        bounds = limits or Limits()
-        ends = [(bounds.low, -np.inf), (bounds.high, np.inf)]
-        low, high = (one if one is not None and np.shape(one) in ((), (dim,)) else free for one, free in ends)
-        spans: list[Span] = [(np.broadcast_to(low, dim), np.broadcast_to(high, dim))]
-        unknown = np.full(dim, -np.inf), np.full(dim, np.inf)
-        spans.append(unknown if self.action is None or len(self.action[0]) != dim else self.action)
-        spans.append((chunk.min(0), chunk.max(0)))
+        trained = Limits().bounds(dim) if self.action is None or len(self.action[0]) != dim else self.action
+        spans: list[Span] = [(limits or Limits()).bounds(dim), trained, (chunk.min(0), chunk.max(0))]
         lines = [
             f"{'first chunk (#), training (-), limits (.)':<{_WIDTH + 22}}{'chunk':>20}{'training':>20}{'limits':>20}"
         ]

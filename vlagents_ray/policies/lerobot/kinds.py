@@ -27,8 +27,8 @@ from vlagents_ray.registry import require
 
 LONGEST_PREFIX = "rtc_training_max_delay"  # the config's field, of LeRobot after 0.6.1, for π0.5; 0: without prefixes
 _MEMORIES = ("use_visual_memory", "use_proprioceptive_memory")  # fields of π0.5's config in the same versions
-IMAGES = "observation.images"
-FRAMES = ("observation.state", "observation.environment_state", IMAGES)  # inputs of each step of a history
+STATE, ACTION, IMAGES = "observation.state", "action", "observation.images"
+FRAMES = (STATE, "observation.environment_state", IMAGES)  # inputs of each step of a history
 
 
 class Kind:
@@ -364,7 +364,6 @@ class SmolVLAPasses(FlowPasses):
         return self._positions[size]
 
 
-STATE, ACTION = "observation.state", "action"
 _BOUNDS = ("min", "max")  # statistics that scale states and actions
 
 
