@@ -134,9 +134,8 @@ def _run(options: argparse.Namespace) -> LoopReport:
         if topics is not None or make_robot is not None or options.trained_on is not None:
             require_match(contract, contract_of(robot))
             _require_fit(options, agent, robot, guard.limits, say)
-        recorder = None
-        if options.record:
-            recorder = stack.enter_context(Recorder(options.record, hz, interventions=leader is not None))
+        opened = Recorder(options.record, hz, interventions=leader is not None) if options.record else None
+        recorder = None if opened is None else stack.enter_context(opened)
         viewer = None if options.rerun is None else stack.enter_context(open_viewer(options.rerun))
         hangs_s = max(0.2, 5 / hz) + deadline_s
 

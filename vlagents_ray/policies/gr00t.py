@@ -135,7 +135,7 @@ def _action(groups: Any, dim: int, *, converted: bool) -> ActionSpec:
     GR00T converts relative groups to absolute ones if the processor has `use_relative_action`.
     """
     stated = [group for group in groups if converted and group["rep"] in _CONVERTED]
-    tables = {"delta": (_CONVERTED, "rep"), "space": (_SPACES, "type"), "rotation": (_ROTATIONS, "format")}
+    tables: Any = {"delta": (_CONVERTED, "rep"), "space": (_SPACES, "type"), "rotation": (_ROTATIONS, "format")}
     found = {name: {table.get(group[key]) for group in stated} for name, (table, key) in tables.items()}
     return ActionSpec(dim=dim, **{name: one.pop() for name, one in found.items() if len(one) == 1})
 

@@ -10,7 +10,7 @@ import inspect
 from collections.abc import Mapping, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import replace
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 
@@ -35,6 +35,7 @@ class Kind:
     """The default for any type: one row at a time with a seed from its session, which is slow but exact."""
 
     batched = False
+    lengths: ClassVar[tuple[str, ...]] = ("chunk_size", "n_action_steps")  # the config's rows of a chunk, by preference
     random: RandomSteps | None = None  # of the last sampled chunks
     given: Mapping[int, int] = {}  # number of rows that the last sampled chunks were given, by the row of the batch
 
@@ -56,7 +57,7 @@ class Kind:
     @property
     def horizon(self) -> int:
         """The number of rows of a chunk, counted from the current tick."""
-        return int(getattr(self.config, "chunk_size", 0) or self.config.n_action_steps)
+        return int(getattr(self.config, self.lengths[0], 0) or getattr(self.config, self.lengths[-1]))
 
     @property
     def dim(self) -> int:
@@ -479,9 +480,7 @@ class ActPolicy(Kind):
 class Fast(Kind):
     """π0-FAST, which decodes only the tokens of rows that are executed."""
 
-    @property
-    def horizon(self) -> int:
-        return int(self.config.n_action_steps)
+    lengths = ("n_action_steps",)
 
 
 class Evo1(Kind):
@@ -518,16 +517,12 @@ class XVla(Kind):
 class VqBet(Kind):
     """VQ-BeT, which samples the codes of its residual VQ; checkpoints of its first training phase have no codes."""
 
-    batched = True
+    batched, lengths = True, ("action_chunk_size",)
 
     def __init__(self, policy: Any, compilation: Compilation) -> None:
         super().__init__(policy, compilation)
         if not policy.vqbet.action_head.vqvae_model.discretized.item():
             raise ConfigError("checkpoint: VQ-BeT's residual VQ is not trained in it; train on, or name a later step")
-
-    @property
-    def horizon(self) -> int:
-        return int(self.config.action_chunk_size)
 
     def draw(self, batch: dict[str, Any], rows: Sequence[Row], leftovers: Sequence[Any]) -> Any:
         with row_draws(rows, self.policy.vqbet):
