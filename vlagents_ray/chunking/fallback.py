@@ -49,11 +49,7 @@ class Held(NamedTuple):
 
 
 WAITING = Held("waiting", "waiting for an answer: all rows of the last one have been executed")
-LATE = Held(
-    "late",
-    "the answer came so late that others had been executed in place of all its rows, or more than it was given as its "
-    "first ones; lower the latency or the control rate",
-)
+LATE = Held("late", "the answer came so late that the robot had passed its rows; lower the latency, or the rate (hz)")
 OLD = Held("old", "what was planned is older than max_age_s")
 STALE = Held(
     "stale",

@@ -148,15 +148,9 @@ def _run(options: argparse.Namespace) -> LoopReport:
         if topics is not None:
             topics.watchdog = watchdog
         stack.enter_context(_restarting(watchdog, say))
+        given = named(options, "instruction", "seconds", "restart", "real_time")
         report = run_loop(
-            robot,
-            player,
-            hz=hz,
-            watchdog=watchdog,
-            recorder=recorder,
-            viewer=viewer,
-            commands=commands,
-            **named(options, "instruction", "seconds", "restart", "real_time"),
+            robot, player, hz=hz, watchdog=watchdog, recorder=recorder, viewer=viewer, commands=commands, **given
         )
         if report.outcome:
             say(f"marked as a {report.outcome} on the live page")

@@ -172,12 +172,12 @@ class Transforms:
         openpi's statistics are of transformed numbers: some of ALOHA's joints have another sign, most actions are
         relative to the state. Random numbers show which ones are the robot's own, by a factor and an offset.
         """
-        widths = [sum(parts.values()) for parts in robot.state.values()]
-        sizes, rng = {"state": sum(widths), "actions": robot.action.dim}, np.random.default_rng(0)
-        if not self.bounds or sizes["actions"] is None:
-            return None
-        given = [{name: scale * rng.uniform(0.2, 0.8, dim) for name, dim in sizes.items()} for scale in (0, 1, 1)]
+        widths, rng = [sum(parts.values()) for parts in robot.state.values()], np.random.default_rng(0)
         image, seen = np.zeros((224, 224, 3) if robot.layout == "hwc" else (3, 224, 224), np.uint8), []
+        dims = {"state": sum(widths), "actions": robot.action.dim}
+        if not self.bounds or dims["actions"] is None:
+            return None
+        given = [{name: scale * rng.uniform(0.2, 0.8, dim) for name, dim in dims.items()} for scale in (0, 1, 1)]
         for one in given:
             data: dict[str, Any] = {"actions": np.array(one["actions"], ndmin=2)}  # a copy, which transforms change
             state = zip(robot.state, np.split(one["state"], np.cumsum(widths)[:-1]), strict=True)
@@ -185,12 +185,12 @@ class Transforms:
                 _put(data, key, value)
             seen.append(self.forward(data))
         found: dict[str, Any] = {"parts": [part for parts in robot.state.values() for part in parts]}
-        for name, key in (("state", "observation.state"), ("actions", "action")):
-            zero, first, second = (np.ravel(one[name])[: sizes[name]] for one in seen)
+        for (name, dim), key in zip(dims.items(), ("observation.state", "action"), strict=True):
+            zero, first, second = (np.ravel(one[name])[:dim] for one in seen)
             factor = (first - zero) / given[1][name]
             factor[~np.isclose(second, zero + factor * given[2][name], atol=1e-4) | (factor == 0)] = np.nan
-            ends = np.sort([(bound[name][: sizes[name]] - zero) / factor for bound in self.bounds], axis=0)
-            found[key] = {_ENDS[i]: [None if np.isnan(x) else x for x in row] for i, row in enumerate(ends.tolist())}
+            ends = np.sort([(bound[name][:dim] - zero) / factor for bound in self.bounds], axis=0).tolist()
+            found[key] = {_ENDS[i]: [None if np.isnan(x) else x for x in row] for i, row in enumerate(ends)}
         return found
 
 

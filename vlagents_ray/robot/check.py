@@ -265,13 +265,10 @@ class _Suite:
                 self.report.skipped.setdefault(name, reason)
 
     def _agreed(self, motion: str) -> bool:
-        self._when = ""
-        if self._operator is None:
-            self.skip_others("no operator agreed to a motion")
-        elif self._operator.agrees(motion):
-            self._when = motion
-        else:
-            self.skip_others(f"the operator did not agree to {motion}")
+        self._when = motion if self._operator is not None and self._operator.agrees(motion) else ""
+        if not self._when:
+            refused = f"the operator did not agree to {motion}"
+            self.skip_others("no operator agreed to a motion" if self._operator is None else refused)
         return bool(self._when)
 
     def _passes(self, *checks: str) -> None:
