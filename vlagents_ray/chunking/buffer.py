@@ -162,7 +162,7 @@ class ChunkBuffer:
 
     def outruns(self, step: int, info: Mapping[str, Any]) -> bool:
         """Return whether more rows were executed since `step`, that of an answer, than it was `GIVEN` in its `info`."""
-        return self.executed - step > info.get(GIVEN, math.inf)
+        return bool(self.executed - step > info.get(GIVEN, math.inf))
 
     def drop(self, before: float = math.inf) -> bool:
         """Drop chunks with observations from before a time, s of `time.monotonic`; return whether there were any."""

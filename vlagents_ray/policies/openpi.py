@@ -180,8 +180,8 @@ class Transforms:
         given = [{name: scale * rng.uniform(0.2, 0.8, dim) for name, dim in dims.items()} for scale in (0, 1, 1)]
         for one in given:
             data: dict[str, Any] = {"actions": np.array(one["actions"], ndmin=2)}  # a copy, which transforms change
-            state = zip(robot.state, np.split(one["state"], np.cumsum(widths)[:-1]), strict=True)
-            for key, value in (*dict.fromkeys(robot.cameras, image).items(), *state):
+            state = dict(zip(robot.state, np.split(one["state"], np.cumsum(widths)[:-1]), strict=True))
+            for key, value in (dict.fromkeys(robot.cameras, image) | state).items():
                 _put(data, key, value)
             seen.append(self.forward(data))
         found: dict[str, Any] = {"parts": [part for parts in robot.state.values() for part in parts]}

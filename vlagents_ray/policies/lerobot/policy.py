@@ -21,7 +21,8 @@ from vlagents_ray.policies.base.staging import StagedRow
 from vlagents_ray.policies.flow import OFFERED
 from vlagents_ray.policies.lerobot import checkpoint, kinds
 from vlagents_ray.policies.lerobot.config import LeRobotConfig
-from vlagents_ray.policies.lerobot.processors import ACTION, STATE, Processors, own_processors
+from vlagents_ray.policies.lerobot.kinds import ACTION, STATE
+from vlagents_ray.policies.lerobot.processors import Processors, own_processors
 from vlagents_ray.policies.outcomes import attempt
 from vlagents_ray.registry import require
 
