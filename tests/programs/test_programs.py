@@ -1,0 +1,139 @@
+"""Programs that others wrote, as PyPI has them, each in an environment of its own, act with a policy of ours.
+
+The list is in `tests/support/programs.py`. The server is a replica's endpoints in this process.
+"""
+
+from __future__ import annotations
+
+import os
+import subprocess
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from itertools import pairwise
+from pathlib import Path
+from typing import Any, ClassVar
+
+import numpy as np
+import program_clients as clients
+import pytest
+from asgi_server import served
+from dialect_server import METADATA
+from in_process_replicas import Replicas
+from peer_environment import drive, environment
+from programs import PROGRAMS
+
+from vlagents_ray import Act, Agent, Obs
+from vlagents_ray.contract import ActionSpec, Contract
+from vlagents_ray.protocol.messages import DEFAULT_LIMITS
+from vlagents_ray.registry import dialect_class
+from vlagents_ray.serve.access.api_keys import NoKey
+from vlagents_ray.serve.config.dialects import DialectArgs
+from vlagents_ray.serve.dialects.base import GatewayContext, ReplicaContext, RouteDialect, dialect_routes
+from vlagents_ray.serve.endpoints.access_middleware import AccessMiddleware
+from vlagents_ray.serve.endpoints.http import build_http_app
+from vlagents_ray.serve.ports import free_port, reserve
+
+ROWS = 4
+
+
+def chunk(acts: int, dim: int) -> np.ndarray:
+    """The rows of the act of that number: numbers in [0, 1] that no two rows share, exact in float32."""
+    return (np.arange(ROWS * dim, dtype=np.float32).reshape(ROWS, dim) + 64 * (acts - 1)) / 1024
+
+
+class Witness(Agent):
+    """A policy that notes what it sees; its gripper is 1 when open."""
+
+    seen: ClassVar[list[tuple[Obs, str | None, int]]] = []  # by all sessions: with the instruction and the act's number
+
+    def __init__(self, dim: int) -> None:
+        self.dim = dim
+
+    @property
+    def contract(self) -> Contract:
+        return Contract(action=ActionSpec(dim=self.dim, gripper_open=1.0, gripper_closed=0.0), chunk=ROWS)
+
+    def reset(self, obs: Obs, instruction: str | None, **kwargs: object) -> dict[str, object]:
+        self.instruction, self.acts = instruction, 0
+        return {}
+
+    def act(self, obs: Obs) -> Act:
+        self.acts += 1
+        self.seen.append((obs, self.instruction, self.acts))
+        return Act(chunk(self.acts, self.dim))
+
+
+@contextmanager
+def serving(dim: int, dialects: Mapping[str, Any]) -> Iterator[int]:
+    """The port of a replica with these dialects, or with the one gateway among them."""
+    Witness.seen.clear()
+    replicas = Replicas([Witness(dim)])
+    [engine] = replicas.engines
+    try:
+        [name] = dialects
+        cls = dialect_class(name)
+        if issubclass(cls, RouteDialect):
+            routes = dialect_routes(DialectArgs(**dialects), ReplicaContext(engine, lambda: METADATA, DEFAULT_LIMITS))
+            inside = build_http_app(engine, lambda: METADATA, DEFAULT_LIMITS, more=routes)
+            with served(AccessMiddleware(inside, None, "app")) as port:
+                yield port
+            return
+        port = free_port()
+        context = GatewayContext(
+            "app", lambda *_: replicas.agent(), DEFAULT_LIMITS, 4, 60.0, engine.contract, NoKey.OPEN
+        )
+        dialect = cls(name, cls.Config(port=port, **dialects[name]), context)
+        dialect.serve(reserve(name, "127.0.0.1", port))
+        yield port
+        dialect.close()
+    finally:
+        replicas.close()
+
+
+@pytest.mark.parametrize(
+    "name", [pytest.param(name, marks=pytest.mark.program(name)) for name, one in PROGRAMS.items() if one.client]
+)
+def test_it_executes_the_policys_actions(name: str) -> None:
+    program = PROGRAMS[name]
+    python = environment(program.client, [*program.options, *program.requirements], program.python)
+    with serving(program.dim, program.dialects) as port:
+        said = drive(python, program.client, port, script=Path(clients.__file__))
+    executed, seen = np.array(said["executed"]), Witness.seen
+    assert len(executed) == clients.STEPS
+    assert len(seen) == clients.STEPS // program.used
+    stateless = "openvla" in program.dialects
+    assert [acts for _, _, acts in seen] == ([1] * len(seen) if stateless else list(range(1, len(seen) + 1)))
+    for number, (obs, instruction, _) in enumerate(seen):
+        assert instruction == clients.TASK
+        assert sorted(obs.cameras) == sorted(said["cameras"])
+        for image in obs.cameras.values():
+            middle = image[image.shape[0] // 2, image.shape[1] // 2].astype(int)
+            assert np.abs(middle - clients.picture(number * program.used)[0, 0]).max() <= 1  # one sends JPEG's pixels
+        assert bool(obs.state) == bool(said["state"])
+        for key, part in said["state"].items():
+            np.testing.assert_array_equal(obs.state[key], np.float32(part))
+        assert obs.gripper == (None if said["gripper"] is None else pytest.approx(said["gripper"]))
+    expected = np.concatenate([chunk(acts, program.dim)[: program.used] for _, _, acts in seen])
+    np.testing.assert_allclose(executed, expected[:, : executed.shape[1]], atol=1e-6)
+
+
+SIMPLE_CLIENT = "openpi examples/simple_client"
+
+
+@pytest.mark.source("OPENPI_SRC")
+@pytest.mark.program(SIMPLE_CLIENT)
+@pytest.mark.parametrize(("env", "preset", "dim"), [("DROID", "openpi-droid", 8), ("ALOHA_SIM", "openpi-aloha", 14)])
+def test_openpis_example_runs_to_its_end(env: str, preset: str, dim: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    folder = Path(os.environ["OPENPI_SRC"]) / "examples" / "simple_client"
+    theirs = ["--requirement", str(folder / "requirements.txt")]
+    python = environment("simple-client", [*theirs, *PROGRAMS[SIMPLE_CLIENT].requirements], "3.11")
+    with serving(dim, {"openpi": {"mapping": preset}}) as port:
+        command = [str(python), str(folder / "main.py"), "--host", "127.0.0.1", "--port", str(port), "--env", env]
+        done = subprocess.run([*command, "--num-steps", "5"], capture_output=True, text=True, timeout=120, check=False)
+    assert done.returncode == 0, done.stderr
+    assert "client_infer_ms" in done.stdout
+    assert [acts for _, _, acts in Witness.seen] == list(range(1, 8))  # two calls warm it up
+    assert all(
+        not np.array_equal(one.cameras["front"], other.cameras["front"])
+        for (one, _, _), (other, _, _) in pairwise(Witness.seen)
+    )
