@@ -1,7 +1,7 @@
 """Python environments with other systems' clients from PyPI, some of whose requirements conflict with ours.
 
-They are `.venv-peers` and `.venv-peers-torch` of this checkout, those that the benchmark uses, and `.venv-peers-NAME` of
-single programs; each is created at first use.
+They are `.venv-peers` and `.venv-peers-torch` of this checkout, those that the benchmark uses, and `.venv-peers-NAME`
+of single programs; each is created at first use.
 """
 
 from __future__ import annotations

@@ -7,15 +7,16 @@ outcomes with the versions in `programs.json`, and `make programs` does all of i
 from __future__ import annotations
 
 import json
+import os
 import platform
 from collections import Counter
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from importlib.metadata import distributions
-from pathlib import Path
 from typing import Any
 
 import pytest
+import yaml
 from verified import ROOT, installed_version
 
 NOTED = ROOT / "tests" / "programs.json"
@@ -73,7 +74,7 @@ _G1 = {
 _POSE = {name: {"start": i, "stop": i + 1} for i, name in enumerate(("x", "y", "z", "roll", "pitch", "yaw", "gripper"))}
 
 PROGRAMS = {
-    "openpi-client": Program(("openpi-client",), "openpi", said="0.1.2 also needs `typing_extensions`, which it does not require"),
+    "openpi-client": Program(("openpi-client",), "openpi", said="0.1.2 needs `typing_extensions` besides"),
     "openpi examples/simple_client": Program(
         ("OPENPI_SRC", "openpi-client"), "openpi", "GitHub", "a preset for each `--env`; only applications at the root",
         requirements=_OPENPI,
@@ -85,7 +86,9 @@ PROGRAMS = {
     "vla-eval": Program(("vla-eval",), "vla_eval", said="`server.url` ends in `/vla-eval`"),
     "vlagents": Program(("vlagents",), "vlagents", said="a port; `model` is the application's name"),
     "LeRobot asynchronous inference": Program(("lerobot",), "lerobot", said="a port"),
-    "LeRobot lerobot-record": Program(("lerobot",), "plug-in", said="`--dataset.reset_time_s=0` without a teleoperator"),
+    "LeRobot lerobot-record": Program(
+        ("lerobot",), "plug-in", said="without a teleoperator: `--dataset.reset_time_s=0`; 0.6 takes no policy"
+    ),
     "LeRobot lerobot-eval": Program(("lerobot",), "plug-in", said="0.6: `--eval.use_async_envs=false`"),
     "LeRobot lerobot-rollout with RTC": Program(("lerobot",), "plug-in", said="0.6; a policy with real-time chunking"),
     "Gymnasium's checkers": Program(("gymnasium",), "`as_vector_env`"),
@@ -157,14 +160,14 @@ PROGRAMS = {
         requirements=("provael[openpi]==0.46.0", *_OPENPI), dialects={"openpi": {"mapping": "openpi-libero"}},
     ),
 }  # fmt: skip
-# Programs with a protocol of their own: what they speak, and the size of a dialect for it.
+# Programs with a protocol of their own: what they speak, and the size of a dialect, estimated by those that there are.
 OTHERS = {
-    "positronic 0.4.1": "its own WebSocket and gRPC sessions (`/api/v1/session`): about 350 lines",
-    "inspect-robots-xpolicylab 0.1.0": "XPolicyLab's frames, which `upstream` already reads: about 200 lines",
-    "strands-robots 0.5.3, `RemotePolicy`": "JSON texts over WebSocket, images inside: about 200 lines",
-    "atoms-robot 0.1.0": "`POST /v1/act` with base64 images, a path that is ours: about 80 lines, and another port",
-    "agi-diy 0.5.12": "a hosted service's sessions with its own accounts: not for a server of one's own",
-    "roboeval 0.1.1": "`/reset` and `/predict` with a handshake of contracts: about 150 lines",
+    "positronic 0.4.1, `RemotePolicy`": "sessions over WebSocket and gRPC (`/api/v1/session`): about 350 lines",
+    "inspect-robots-xpolicylab 0.1.0": "XPolicyLab's frames, whose servers `upstream` asks: about 250 lines",
+    "strands-robots 0.5.3, `RemotePolicy`": "JSON texts over WebSocket: about 250 lines",
+    "atoms-robot 0.1.0": "`POST /v1/act` with JPEG in base64, at a path that is ours: about 100 lines, and a port",
+    "roboeval 0.1.1": "HTTP with a handshake that states formats of actions: about 150 lines",
+    "agi-diy 0.5.12": "leases of a hosted service with its own accounts: none",
 }
 
 
@@ -224,8 +227,6 @@ def _shown(name: str) -> str:
 
 def _installed(name: str) -> str:
     if name == "STABLE_BASELINES3_SRC":
-        import os
-
         [found] = [one for one in distributions(path=[os.environ[name]]) if one.name == _shown(name)]
         return found.version
     return installed_version(name)
@@ -236,26 +237,27 @@ def _python(program: Program) -> str:
 
 
 def ran() -> Iterator[str]:
-    """Yield the rows of the table of programs, one for each version that was tried."""
-    yield from ("| program | versions | from | connects to | tests | setting and advice |", "|---|---|---|---|---|---|")
+    """Yield the rows of the table of programs, one for each Python in which one was tried."""
+    yield from ("| program | versions | from | connects to | tests | advice |", "|---|---|---|---|---|---|")
     noted = notes()
     for name, program in PROGRAMS.items():
-        setting = f"`{_flow(program.dialects)}`" if program.dialects else ""
-        said = "; ".join(filter(None, (setting, program.said)))
         for one in noted.get(name, {"": {}}).values():
             outcomes = ", ".join(f"{one[what]} {what}" for what in ("passed", "failed", "skipped") if what in one)
-            cells = (name, one.get("versions", ""), program.source, program.connects, outcomes or "not run", said)
-            yield f"| {' | '.join(cells)} |"
+            cells = (name, one.get("versions", ""), program.source, program.connects, outcomes or "not run")
+            yield f"| {' | '.join((*cells, program.said))} |"
+
+
+def settings() -> Iterator[str]:
+    """Yield a block of YAML with the dialects of each program's server."""
+    yield "```yaml"
+    for name, program in PROGRAMS.items():
+        if program.dialects:
+            yield f"# {name}"
+            yield yaml.safe_dump(dict(program.dialects), sort_keys=False, default_flow_style=None, width=110).rstrip()
+    yield "```"
 
 
 def others() -> Iterator[str]:
     """Yield the rows of the table of programs that would need another dialect."""
     yield from ("| program | protocol, and the size of a dialect |", "|---|---|")
     yield from (f"| {name} | {what} |" for name, what in OTHERS.items())
-
-
-def _flow(value: Any) -> str:
-    """A value in YAML's flow style, on one line."""
-    if isinstance(value, Mapping):
-        return "{" + ", ".join(f"{name}: {_flow(one)}" for name, one in value.items()) + "}"
-    return json.dumps(value) if isinstance(value, bool) else str(value)

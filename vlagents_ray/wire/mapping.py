@@ -440,7 +440,7 @@ class KeyMapping:
         return self.columns(rows) or {"action": rows}
 
     def columns(self, rows: np.ndarray) -> dict[str, np.ndarray]:
-        """Return the columns of (H, D) rows, or of one row (D,), by the client's names; none if the mapping has none."""
+        """Return the columns of (H, D) rows, or of a row (D,), by the client's names; none if the mapping has none."""
         return {name: rows[..., one.start : one.stop] for name, one in self.action.items()}
 
     def lacks(self, contract: Contract | None) -> list[str]:
