@@ -192,7 +192,7 @@ class RunPrograms:
         for name, outcomes in self._outcomes.items():
             if outcomes.keys() != {"skipped"}:
                 program = PROGRAMS[name]
-                noted.setdefault(name, {})[_python(program)] = {"versions": version_of(program), **outcomes}
+                noted.setdefault(name, {})[_python(program)] = {"versions": versions(program), **outcomes}
         if self._outcomes:
             NOTED.write_text(json.dumps({name: noted[name] for name in PROGRAMS if name in noted}, indent=2) + "\n")
 
@@ -203,7 +203,7 @@ def notes() -> dict[str, dict[str, dict[str, Any]]]:
     return found
 
 
-def version_of(program: Program) -> str:
+def versions(program: Program) -> str:
     """The versions of a program's packages, as the table shows them."""
     pinned = {name.partition("[")[0]: number for name, number in _pins(program)}
     return ", ".join(f"{_shown(name)} {pinned.get(name) or _installed(name)}" for name in program.packages)
@@ -227,7 +227,7 @@ def _shown(name: str) -> str:
 
 def _installed(name: str) -> str:
     if name == "STABLE_BASELINES3_SRC":
-        [found] = [one for one in distributions(path=[os.environ[name]]) if one.name == _shown(name)]
+        [found] = distributions(path=[os.environ[name]])  # a folder with this alone
         return found.version
     return installed_version(name)
 
