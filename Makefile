@@ -129,12 +129,14 @@ verified:
 	@$(MAKE) --no-print-directory $(addprefix verified-,$(filter-out libero libero_pro rcs,$(FAMILIES)))
 	$(BIN)/python tests/support/verified.py
 
-# Each in an environment of its own; Stable-Baselines3 beside the torch of this one. openpi's examples want OPENPI_SRC, and
+# Each in an environment of its own; Stable-Baselines3 and TorchRL in folders beside the torch of this one. openpi's examples want OPENPI_SRC, and
 # LeRobot 0.6 FAMILIES="lerobot lerobot06".
 PROGRAMS := tests/programs tests/learn tests/integration/test_dialects.py tests/integration/test_gateways.py
 programs: export STABLE_BASELINES3_SRC := $(CURDIR)/build/stable-baselines3
+programs: export TORCHRL_SRC := $(CURDIR)/build/torchrl
 programs: setup $(patsubst %,$(VENV)-%/.installed,$(filter lerobot%,$(FAMILIES)))
 	$(PIP) install --quiet --no-deps --upgrade --target "$$STABLE_BASELINES3_SRC" stable-baselines3==2.9.2
+	$(PIP) install --quiet --no-deps --upgrade --target "$$TORCHRL_SRC" torchrl==0.14.1 tensordict==0.14.3 pyvers==0.2.3
 	status=0; options='-p no:cacheprovider -m program --verified'; \
 	$(BIN)/python -m pytest $$options $(PROGRAMS) || status=1; \
 	for family in $(filter lerobot%,$(FAMILIES)); do \

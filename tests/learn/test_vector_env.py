@@ -297,3 +297,31 @@ def test_ppo_learns_to_swing_a_pendulum_up() -> None:
     curve = [float(line.split()[1]) for line in printed.splitlines()]
     assert curve[0] < -900, "or the test shows nothing: untrained"
     assert curve[-1] > -400, curve
+
+
+TORCHRL = "TORCHRL_SRC"  # a folder of `pip install --target`
+OF_TORCHRL = """
+import sys
+from torchrl.envs import GymWrapper
+from torchrl.envs.utils import check_env_specs
+from vlagents_ray.learn import as_vector_env
+options = {"width": 32, "height": 32, "max_steps": 6}
+envs = as_vector_env("tabletop/lift", 2, observation=sys.argv[1], autoreset="disabled", env_options=options)
+env = GymWrapper(envs)
+env.set_seed(3)
+check_env_specs(env)
+played = env.rollout(20, break_when_any_done=False)
+print(*played.shape, int(played["next", "done"].sum()))
+"""
+
+
+@pytest.mark.source(TORCHRL)
+@pytest.mark.program("TorchRL")
+@pytest.mark.torch
+@pytest.mark.parametrize("observation", ["state", "all"])
+def test_torchrl_takes_them_for_its_own_and_resets_each_that_is_over(observation: str) -> None:
+    environment = {**os.environ, "PYTHONPATH": f"{ROOT}:{os.environ[TORCHRL]}"}
+    command = [sys.executable, "-c", OF_TORCHRL, observation]
+    done = subprocess.run(command, cwd=ROOT, env=environment, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.splitlines()[-1] == "2 20 6"  # 2 environments, 20 steps, 3 whole episodes of 6 in each

@@ -21,6 +21,7 @@ from verified import ROOT, installed_version
 
 NOTED = ROOT / "tests" / "programs.json"
 PYPI = "PyPI"
+BESIDE = {"stable-baselines3": "STABLE_BASELINES3_SRC", "torchrl": "TORCHRL_SRC"}  # folders beside the torch of .venv
 
 
 @dataclass(frozen=True)
@@ -93,7 +94,10 @@ PROGRAMS = {
     "LeRobot lerobot-rollout with RTC": Program(("lerobot",), "plug-in", said="0.6; a policy with real-time chunking"),
     "Gymnasium's checkers": Program(("gymnasium",), "`as_vector_env`"),
     "Stable-Baselines3": Program(
-        ("STABLE_BASELINES3_SRC",), "`as_vector_env`", said="the adapter of `docs/evaluation/stable_baselines.py`"
+        ("stable-baselines3",), "`as_vector_env`", said="the adapter of `docs/evaluation/stable_baselines.py`"
+    ),
+    "TorchRL": Program(
+        ("torchrl",), "`as_vector_env`", said='`GymWrapper(as_vector_env(…, autoreset="disabled"))`'
     ),
     "inspect-robots-franka": Program(
         ("inspect-robots-franka", "inspect-robots", "openpi-client"), "openpi", client="franka", dim=8,
@@ -205,30 +209,21 @@ def notes() -> dict[str, dict[str, dict[str, Any]]]:
 
 def versions(program: Program) -> str:
     """The versions of a program's packages, as the table shows them."""
-    pinned = {name.partition("[")[0]: number for name, number in _pins(program)}
-    return ", ".join(f"{_shown(name)} {pinned.get(name) or _installed(name)}" for name in program.packages)
+    pinned = _pins(program)
+    found = {name: pinned.get(name) or _installed(name) for name in program.packages}
+    return ", ".join(f"{name.removesuffix('_SRC').lower()} {number}" for name, number in found.items())
 
 
-def _pins(program: Program) -> list[tuple[str, str]]:
-    """The versions that a program's environment has, or those of the environments of other servers."""
-    wanted = list(program.requirements)
-    if not wanted and "lerobot" not in program.packages:  # LeRobot is tested in environments of several versions
-        wanted = [
-            line
-            for file in (ROOT / "benchmarks/peers").glob("requirements*.txt")
-            for line in file.read_text().split("\n")
-        ]
-    return [(name, number) for name, equal, number in (line.partition("==") for line in wanted) if equal]
-
-
-def _shown(name: str) -> str:
-    return {"OPENPI_SRC": "openpi", "STABLE_BASELINES3_SRC": "stable-baselines3"}.get(name, name)
+def _pins(program: Program) -> dict[str, str]:
+    """The versions that a program's environment has, or that of the peers' clients, by package."""
+    wanted = list(program.requirements) or (ROOT / "benchmarks/peers/requirements.txt").read_text().splitlines()
+    pins = (line.partition("==") for line in wanted)
+    return {name.partition("[")[0]: number for name, equal, number in pins if equal}
 
 
 def _installed(name: str) -> str:
-    if name == "STABLE_BASELINES3_SRC":
-        [found] = distributions(path=[os.environ[name]])  # a folder with this alone
-        return found.version
+    if name in BESIDE:
+        return next(iter(distributions(name=name, path=[os.environ[BESIDE[name]]]))).version
     return installed_version(name)
 
 
