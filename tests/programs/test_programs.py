@@ -117,23 +117,38 @@ def test_it_executes_the_policys_actions(name: str) -> None:
     np.testing.assert_allclose(executed, expected[:, : executed.shape[1]], atol=1e-6)
 
 
-SIMPLE_CLIENT = "openpi examples/simple_client"
-
-
-@pytest.mark.source("OPENPI_SRC")
-@pytest.mark.program(SIMPLE_CLIENT)
-@pytest.mark.parametrize(("env", "preset", "dim"), [("DROID", "openpi-droid", 8), ("ALOHA_SIM", "openpi-aloha", 14)])
-def test_openpis_example_runs_to_its_end(env: str, preset: str, dim: int, monkeypatch: pytest.MonkeyPatch) -> None:
-    folder = Path(os.environ["OPENPI_SRC"]) / "examples" / "simple_client"
-    theirs = ["--requirement", str(folder / "requirements.txt")]
-    python = environment("simple-client", [*theirs, *PROGRAMS[SIMPLE_CLIENT].requirements], "3.11")
-    with serving(dim, {"openpi": {"mapping": preset}}) as port:
-        command = [str(python), str(folder / "main.py"), "--host", "127.0.0.1", "--port", str(port), "--env", env]
-        done = subprocess.run([*command, "--num-steps", "5"], capture_output=True, text=True, timeout=120, check=False)
+def run_example(name: str, *options: str, **variables: str) -> str:
+    """Run an example of openpi to its end with the packages that it pins; return its output."""
+    program = PROGRAMS[f"openpi examples/{name}"]
+    folder = Path(os.environ["OPENPI_SRC"]) / "examples" / name
+    theirs = ["--requirement", str(folder / "requirements.txt"), *program.requirements]
+    command = [str(environment(name, theirs, program.python)), str(folder / "main.py"), *options]
+    done = subprocess.run(command, env=os.environ | variables, capture_output=True, text=True, timeout=500, check=False)
     assert done.returncode == 0, done.stderr
-    assert "client_infer_ms" in done.stdout
-    assert [acts for _, _, acts in Witness.seen] == list(range(1, 8))  # two calls warm it up
+    acts = [acts for _, _, acts in Witness.seen]
+    assert acts == list(range(1, len(acts) + 1))  # one session
     assert all(
         not np.array_equal(one.cameras["front"], other.cameras["front"])
         for (one, _, _), (other, _, _) in pairwise(Witness.seen)
     )
+    return done.stdout
+
+
+@pytest.mark.source("OPENPI_SRC")
+@pytest.mark.program("openpi examples/simple_client")
+@pytest.mark.parametrize(("env", "preset", "dim"), [("DROID", "openpi-droid", 8), ("ALOHA_SIM", "openpi-aloha", 14)])
+def test_openpis_simple_client_measures_the_server(env: str, preset: str, dim: int) -> None:
+    with serving(dim, {"openpi": {"mapping": preset}}) as port:
+        options = ("--host", "127.0.0.1", "--port", str(port), "--env", env, "--num-steps", "5")
+        assert "client_infer_ms" in run_example("simple_client", *options)
+    assert len(Witness.seen) == 7  # two calls warm it up
+
+
+@pytest.mark.source("OPENPI_SRC")
+@pytest.mark.program("openpi examples/aloha_sim")
+def test_openpis_aloha_example_plays_an_episode(tmp_path: Path) -> None:
+    with serving(14, {"openpi": {"mapping": "openpi-aloha"}}) as port:
+        options = ("--args.host", "127.0.0.1", "--args.port", str(port), "--args.action-horizon", str(ROWS))
+        run_example("aloha_sim", *options, "--args.out-dir", str(tmp_path), MUJOCO_GL="egl")
+    assert len(Witness.seen) == 300 // ROWS
+    assert [video.suffix for video in tmp_path.iterdir()] == [".mp4"]

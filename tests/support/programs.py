@@ -80,6 +80,7 @@ PROGRAMS = {
         ("OPENPI_SRC", "openpi-client"), "openpi", "GitHub", "a preset for each `--env`; only applications at the root",
         requirements=_OPENPI,
     ),
+    "openpi examples/aloha_sim": Program(("OPENPI_SRC", "openpi-client"), "openpi", "GitHub", requirements=_OPENPI),
     "RoboArena's messages": Program(
         ("openpi-client",), "roboarena", said="openpi's client with RoboArena's requests, as theirs is on no index"
     ),
