@@ -8,7 +8,7 @@ from __future__ import annotations
 import os
 import subprocess
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from itertools import pairwise
 from pathlib import Path
 from typing import Any, ClassVar
@@ -65,29 +65,25 @@ class Witness(Agent):
 
 @contextmanager
 def serving(dim: int, dialects: Mapping[str, Any]) -> Iterator[int]:
-    """The port of a replica with these dialects, or with the one gateway among them."""
+    """The port of a replica with this dialect on its own port, or of a gateway with it."""
     Witness.seen.clear()
-    replicas = Replicas([Witness(dim)])
-    [engine] = replicas.engines
-    try:
-        [name] = dialects
+    with ExitStack() as stack:
+        replicas = Replicas([Witness(dim)])
+        stack.callback(replicas.close)
+        [engine] = replicas.engines
+        [(name, settings)] = dialects.items()
         cls = dialect_class(name)
         if issubclass(cls, RouteDialect):
             routes = dialect_routes(DialectArgs(**dialects), ReplicaContext(engine, lambda: METADATA, DEFAULT_LIMITS))
             inside = build_http_app(engine, lambda: METADATA, DEFAULT_LIMITS, more=routes)
-            with served(AccessMiddleware(inside, None, "app")) as port:
-                yield port
+            yield stack.enter_context(served(AccessMiddleware(inside, None, "app")))
             return
-        port = free_port()
-        context = GatewayContext(
-            "app", lambda *_: replicas.agent(), DEFAULT_LIMITS, 4, 60.0, engine.contract, NoKey.OPEN
-        )
-        dialect = cls(name, cls.Config(port=port, **dialects[name]), context)
+        port, agent = free_port(), lambda *_: replicas.agent()
+        context = GatewayContext("app", agent, DEFAULT_LIMITS, 4, 60.0, engine.contract, NoKey.OPEN)
+        dialect = cls(name, cls.Config(port=port, **settings), context)
+        stack.callback(dialect.close)
         dialect.serve(reserve(name, "127.0.0.1", port))
         yield port
-        dialect.close()
-    finally:
-        replicas.close()
 
 
 @pytest.mark.parametrize(
