@@ -101,7 +101,7 @@ PROGRAMS = {
     ),
     "inspect-robots-franka": Program(
         ("inspect-robots-franka", "inspect-robots", "openpi-client"), "openpi", client="franka", dim=8,
-        requirements=_adapter("franka", "0.1.0", *_OPENPI), dialects={"openpi": {"mapping": "openpi-droid"}},
+        said="absolute positions: `actions_are_velocity=False`", requirements=_adapter("franka", "0.1.0", *_OPENPI), dialects={"openpi": {"mapping": "openpi-droid"}},
     ),
     "inspect-robots-widowx openpi": Program(
         ("inspect-robots-widowx", "inspect-robots", "openpi-client"), "openpi", client="widowx_openpi",
