@@ -101,7 +101,8 @@ PROGRAMS = {
     ),
     "inspect-robots-franka": Program(
         ("inspect-robots-franka", "inspect-robots", "openpi-client"), "openpi", client="franka", dim=8,
-        said="absolute positions: `actions_are_velocity=False`", requirements=_adapter("franka", "0.1.0", *_OPENPI), dialects={"openpi": {"mapping": "openpi-droid"}},
+        said="for positions: `actions_are_velocity=False`",
+        requirements=_adapter("franka", "0.1.0", *_OPENPI), dialects={"openpi": {"mapping": "openpi-droid"}},
     ),
     "inspect-robots-widowx openpi": Program(
         ("inspect-robots-widowx", "inspect-robots", "openpi-client"), "openpi", client="widowx_openpi",
@@ -144,13 +145,13 @@ PROGRAMS = {
         dialects={"openpi": {"mapping": {"preset": "openpi-droid", "action": {"action": {}}}}},
     ),
     "strands-robots-sim GR00T N1.5": Program(
-        ("strands-robots-sim",), "gr00t", client="strands_robots_sim", said="without its simulators",
+        ("strands-robots-sim",), "gr00t", client="strands_robots_sim",
         requirements=("strands-robots-sim==0.1.1", "msgpack", "pyzmq", "numpy"), options=("--no-deps",),
         dialects={"gr00t": {"mapping": {"preset": "gr00t-n1.5", "action": _POSE}}},
     ),
     "positronic RoboArena": Program(
         ("positronic", "positronic-wire"), "roboarena", client="positronic", dim=8,
-        said="without its simulators and drivers", options=("--no-deps",),
+        said="numbers cameras from 1", options=("--no-deps",),
         requirements=(
             "positronic==0.4.1", "positronic-wire==0.12.0", "positronic-model-server==0.3.1",
             "positronic-eval-vocabulary==0.6.0", "boto3", "botocore", "jmespath", "msgpack", "msgpack-numpy", "numpy",
@@ -161,6 +162,7 @@ PROGRAMS = {
     ),
     "provael": Program(
         ("provael", "openpi-client"), "openpi", client="provael", python="3.12", used=1,
+        said="executes the first row of each chunk",
         requirements=("provael[openpi]==0.46.0", *_OPENPI), dialects={"openpi": {"mapping": "openpi-libero"}},
     ),
 }  # fmt: skip
