@@ -15,7 +15,7 @@ import numpy as np
 from pydantic import Field
 
 from vlagents_ray.contract import ActionSpec, Contract, StateSpec
-from vlagents_ray.errors import ConfigError, InvalidObservation
+from vlagents_ray.errors import ConfigError, InvalidObservation, NotTrainable
 from vlagents_ray.interface import Obs
 from vlagents_ray.policies.base import ModelConfig, ModelPolicy, Prediction, Row
 from vlagents_ray.policies.base.accelerator import fetch, jax_device, torch_device
@@ -248,6 +248,7 @@ class OpenPiModel(abc.ABC):
 
     noise_shape: tuple[int, int] | None = None  # (H, action_dim) of a row's noise; None for a model without noise
     shares = False  # whether several rows can share one observation
+    trained: Any = None  # the torch module that a learner trains; None in JAX
 
     @abc.abstractmethod
     def sample(self, batch: SampleBatch) -> np.ndarray:
@@ -360,7 +361,7 @@ class TorchFlow(OpenPiModel):
     shares = True
 
     def __init__(self, network: Any, device: Any, config: OpenPiConfig, compilation: Compilation) -> None:
-        self._network, self._device = network, device
+        self.trained, self._device = network, device
         self._passes = Pi0Passes(network, compilation)
         self._steps, self._limit = config.steps or _STEPS, config.guidance
         self.noise_shape: tuple[int, int] = (network.config.action_horizon, network.config.action_dim)
@@ -374,7 +375,7 @@ class TorchFlow(OpenPiModel):
         if batch.random is not None:
             changes.append(batch.random.change)
         with torch.inference_mode():
-            inputs = self._network._preprocess_observation(observation, train=False)
+            inputs = self.trained._preprocess_observation(observation, train=False)
             flow = self._passes.sample(*inputs, noise=start, owners=batch.owners, steps=self._steps, changes=changes)
         return fetch(flow.float())
 
@@ -486,6 +487,7 @@ class OpenPi(ModelPolicy):
     Config: ClassVar[type] = OpenPiConfig
     config: OpenPiConfig
     model: LoadedOpenPi | None
+    trainable = "model.model.trained"
 
     @property
     def contract(self) -> Contract:
@@ -507,6 +509,14 @@ class OpenPi(ModelPolicy):
     def continues_plans(self) -> bool:
         flows = self.model is not None and self.model.model.noise_shape is not None
         return flows and self.config.actions == "chunk"
+
+    def _trainable(self) -> Any:
+        if (trained := super()._trainable()) is None:
+            raise NotTrainable(
+                f"checkpoint {self.config.checkpoint}: got a JAX model, whose weights are not replaced while it "
+                f"serves; convert it to PyTorch with openpi's script"
+            )
+        return trained
 
     def load(self) -> LoadedOpenPi:
         use_source("openpi", SOURCE, self.config.source_dir, within=FOLDERS)

@@ -83,7 +83,9 @@ def _overwrite(held: Any, value: Any) -> None:
 @contextmanager
 def evaluation_mode(trainable: Any) -> Iterator[None]:
     """Put torch modules into evaluation mode (no dropout, no batch statistics), and restore the mode of each part."""
-    leaves = _leaves(trainable) if isinstance(trainable, dict | list) else [("", [trainable], 0)]
+    leaves: Iterable[tuple[str, Any, Any]] = (
+        _leaves(trainable) if isinstance(trainable, dict | list) else [("", [trainable], 0)]
+    )
     values = [container[key] for _, container, key in leaves]
     parts = [part for value in values if _is_module(value) for part in value.modules()]
     modes = [part.training for part in parts]

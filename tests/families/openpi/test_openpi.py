@@ -11,7 +11,7 @@ from jax_compiles import jax_compiles
 
 from tests.families.openpi.conftest import MARKS
 from vlagents_ray import Act, Obs
-from vlagents_ray.errors import ConfigError, InvalidObservation, MissingCamera
+from vlagents_ray.errors import ConfigError, InvalidObservation, MissingCamera, NotTrainable
 from vlagents_ray.interface import DELAY, DISTRIBUTION, LEFTOVER, SAMPLES
 from vlagents_ray.policies.base import policy as base_policy
 from vlagents_ray.serve.config.dialects import presets
@@ -213,6 +213,11 @@ def test_what_a_row_says_after_its_end_is_dropped() -> None:
 
     tokens = np.array([[5, 1, 7, 1], [5, 6, 7, 8]])
     np.testing.assert_array_equal(JaxTokens.ended(tokens), [[5, 1, 0, 0], [5, 6, 7, 8]])
+
+
+def test_a_jax_model_refuses_pushed_weights(loaded: Any) -> None:
+    with pytest.raises(NotTrainable, match=r"got a JAX model.*convert it to PyTorch"):
+        loaded("pi0").parameters()
 
 
 def test_a_compiled_loop_has_no_random_steps(loaded: Any) -> None:

@@ -6,12 +6,11 @@ from types import SimpleNamespace
 from typing import Any
 
 import pytest
+from pushed_weights import check_pushed_weights
+
+from vlagents_ray.policies.openvla.oft import Mlp, OpenVLAOFT, OpenVLAOFTConfig, Parallel, Projector
 
 torch = pytest.importorskip("torch")
-
-from pushed_weights import check_pushed_weights  # noqa: E402
-
-from vlagents_ray.policies.openvla.oft import Mlp, OpenVLAOFT, OpenVLAOFTConfig, Parallel, Projector  # noqa: E402
 
 pytestmark = pytest.mark.torch
 
