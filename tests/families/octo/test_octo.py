@@ -177,7 +177,10 @@ def test_no_act_compiles_a_program(pretrained: Path) -> None:
 
 
 def test_it_acts_with_pushed_weights(pretrained: Path) -> None:
+    from flax.traverse_util import flatten_dict
+
     policy = made(pretrained, batch_sizes=[1])
     policy.initialize()
+    assert policy.parameters().keys() == flatten_dict(policy.model.model.params, sep="/").keys()  # those of OctoModel
     obs = seen(1)
     check_pushed_weights(policy, lambda: begun(policy, obs).act(obs).action)

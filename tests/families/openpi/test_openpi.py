@@ -8,10 +8,11 @@ from typing import Any
 import numpy as np
 import pytest
 from jax_compiles import jax_compiles
+from pushed_weights import check_pushed_weights
 
 from tests.families.openpi.conftest import MARKS
 from vlagents_ray import Act, Obs
-from vlagents_ray.errors import ConfigError, InvalidObservation, MissingCamera, NotTrainable
+from vlagents_ray.errors import ConfigError, InvalidObservation, MissingCamera
 from vlagents_ray.interface import DELAY, DISTRIBUTION, LEFTOVER, SAMPLES
 from vlagents_ray.policies.base import policy as base_policy
 from vlagents_ray.serve.config.dialects import presets
@@ -22,6 +23,7 @@ pytestmark = MARKS
 WORDS = ("pick up the cube", "push", "open the upper drawer")
 BATCHED = 1e-5  # how far a batch's actions may be off those of a lone row, in float32 on a CPU
 KINDS = ("pi0", "pi05", "aloha")
+PROGRAMS = {"pi0": ("_encode", "_follow"), "fast": ("_sample",)}
 # openpi's observation -> ours, as a client of each would send it
 MAPPINGS = {"pi0": "openpi-libero", "pi05": "openpi-droid", "aloha": "openpi-aloha", "fast": "openpi-droid"}
 
@@ -215,9 +217,22 @@ def test_what_a_row_says_after_its_end_is_dropped() -> None:
     np.testing.assert_array_equal(JaxTokens.ended(tokens), [[5, 1, 0, 0], [5, 6, 7, 8]])
 
 
-def test_a_jax_model_refuses_pushed_weights(loaded: Any) -> None:
-    with pytest.raises(NotTrainable, match=r"got a JAX model.*convert it to PyTorch"):
-        loaded("pi0").parameters()
+@pytest.mark.parametrize("kind", ["pi0", "fast"])
+def test_it_acts_with_pushed_weights(kind: str, loaded: Any, checkpoint: Any) -> None:
+    from flax.traverse_util import flatten_dict
+    from openpi.models.model import restore_params
+
+    policy = loaded(kind)
+    assert policy.parameters().keys() == flatten_dict(restore_params(checkpoint(kind) / "params"), sep="/").keys()
+    programs = [getattr(policy.model.model, name) for name in PROGRAMS[kind]]
+    compiled = [one._cache_size() for one in programs]
+    check_pushed_weights(policy, lambda: begun(policy, kind, 0).act(seen(kind, 0)).action)
+    assert [one._cache_size() for one in programs] == compiled
+
+
+def test_a_learner_of_adapters_pushes_these_alone(loaded: Any) -> None:
+    policy = loaded("lora")
+    check_pushed_weights(policy, lambda: begun(policy, "pi0", 0).act(seen("pi0", 0)).action, part="lora")
 
 
 def test_a_compiled_loop_has_no_random_steps(loaded: Any) -> None:
