@@ -64,7 +64,7 @@ def correct(env: EvalEnv, policy: Reference, dataset: Dataset, seed: int) -> boo
 def record(
     checkpoint: Annotated[Path, typer.Argument(help="Of the policy.")],
     out: Annotated[Path, typer.Argument(help="New folder of a LeRobotDataset with interventions.")],
-    episodes: Annotated[int, typer.Option(min=1, help="That are played.")] = 1000,
+    episodes: Annotated[int, typer.Option(min=1, help="That are played.")] = 800,
     seed: Annotated[int, typer.Option(help="Of the first one; those of the evaluation begin at 0.")] = 2_000_000,
 ) -> None:
     """Record corrections, losslessly, as the policy gets images without loss."""

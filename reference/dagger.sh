@@ -12,6 +12,6 @@ if [ ! -d "$runs/data" ]; then
 fi
 [ -d "$runs/checkpoint" ] ||
   "$bin/python" reference/train.py "$runs/data" "$runs/checkpoint" --work "$runs/train" --cameras tabletop=front,wrist \
-    --start reference/checkpoint --rate 5e-4 --steps 800
+    --start reference/checkpoint --rate 5e-4 --steps 600
 "$bin/vlagents-ray" eval reference/evaluations/dagger.yaml --out "$runs/evaluation" --resume
 "$bin/python" reference/dagger.py compare "$runs/evaluation"

@@ -262,7 +262,7 @@ def _numbers(one: _Demonstration, about: DatasetContract) -> tuple[dict[str, np.
     dim = one.actions.shape[1]
     together, names = state_vector(one.state, one.gripper, one.parts)
     together = about.wrapped(together)
-    rows = {ACTION: one.actions, **outcome_rows(one.rewards, one.success)}
+    rows: dict[str, Any] = {ACTION: one.actions, **outcome_rows(one.rewards, one.success)}
     features = {ACTION: vector_feature([f"action_{i}" for i in range(dim)]), **number_features(OUTCOMES | INDEX)}
     features[ACTION]["spec"] = one.cell.contract.get("action")
     if names:
