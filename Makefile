@@ -54,7 +54,7 @@ NOT_QUICK := ray or server or hosts or sim or vulkan or torch or gpu or browser 
 # lerobot06 wants Python 3.12, and TORCH_CUDA=1 where no index has a torch without CUDA for it: several GB.
 # calvin wants CALVIN_SRC, a checkout.
 # robocasa is only tested where it is named: 1.3 GB, and a minute.
-FAMILIES ?= libero libero_pro lerobot hf rcs ros
+FAMILIES ?= libero libero_pro lerobot hf rcs ros torchrl
 TESTED_IN_libero := libero robosuite
 TESTED_IN_hf := pi0 arro vjepa2_ac
 TESTED_IN_lerobot06 := lerobot gr00t
@@ -125,7 +125,7 @@ verified-%: $(VENV)-%/.installed
 	$(VENV)-$*/bin/python -m pytest -p no:cacheprovider -m verifies --verified $(addprefix tests/families/,$(or $(TESTED_IN_$*),$*))
 
 verified:
-	@$(MAKE) --no-print-directory $(addprefix verified-,$(filter-out libero libero_pro rcs,$(FAMILIES)))
+	@$(MAKE) --no-print-directory $(addprefix verified-,$(filter-out libero libero_pro rcs ros torchrl,$(FAMILIES)))
 	$(BIN)/python tests/support/verified.py
 
 # Made once for each state of the family's requirements, of what a server installs and of what `env make` adds: not removed as a mere step.
