@@ -25,12 +25,9 @@ from vlagents_ray.contract import ActionSpec, Contract
 from vlagents_ray.errors import ConfigError
 from vlagents_ray.interface import BEHAVIOUR, POLICY, WANT, Act, Agent, Obs
 from vlagents_ray.learn.columns import REPLAY
-from vlagents_ray.learn.publisher import Publisher
 from vlagents_ray.policies.base.model_inputs import camera_images, state_vector
 from vlagents_ray.policies.outcomes import attempt, of_good
 from vlagents_ray.registry import named_class, require
-from vlagents_ray.serve.launch.deployment_file import deployment
-from vlagents_ray.serve.launch.server import running_server
 from vlagents_ray.serve.ports import free_port
 from vlagents_ray.weights.trainable import named_values, set_values
 
@@ -64,14 +61,14 @@ class ServedPolicy(nn.TensorDictModuleBase):  # type: ignore[misc]
         words = [words] * len(obs) if isinstance(words, str) else words.tolist()
         if not self._sessions:
             self._sessions, self._words = [RemoteAgent(self._url, **self._options)], dict[int, str]()
-            self._contract, self._rng = self._sessions[0].contract or Contract(), np.random.default_rng()
+            self._contract, self._seeds = self._sessions[0].contract or Contract(), np.random.default_rng()
         agent = self._sessions[0]
         self._sessions += agent.sessions(len(obs) - len(self._sessions))
         results: list[Any] = []
         begun = [i for i, text in enumerate(words) if self._words.get(i) != text or (first is not None and first[i])]
         if begun:
             of_begun: Any = zip(*((obs[i], words[i], self._sessions[i]) for i in begun), strict=True)
-            results += agent.reset_batch(*of_begun, seeds=self._rng.integers(2**31, size=len(begun)).tolist())
+            results += agent.reset_batch(*of_begun, seeds=self._seeds.integers(2**31, size=len(begun)).tolist())
             self._words |= {i: words[i] for i in begun}
         if nn.probabilistic.interaction_type() == nn.InteractionType.RANDOM:
             want = [name for name in _LEARNED if name in (self._contract.behaviour or ())]
@@ -194,7 +191,12 @@ class PolicyServer:
 
     def start(self) -> Self:
         """Serve the policy, and wait until it is loaded."""
+        # Processes of environments import this module for the client alone, which does without Ray.
         from ray import cloudpickle
+
+        from vlagents_ray.learn.publisher import Publisher
+        from vlagents_ray.serve.launch.deployment_file import deployment
+        from vlagents_ray.serve.launch.server import running_server
 
         with ExitStack() as stack:
             file = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="vlr-torchrl-"))) / "factory"
