@@ -108,3 +108,10 @@ class UpstreamClient(abc.ABC):
         return MalformedMessage(
             f"upstream {self.options.url}: got {got}, want {want}; does it speak the protocol of the deployment?"
         )
+
+
+def stated_rows(metadata: Mapping[str, Any]) -> int | None:
+    """Return `action_horizon` of an engine's metadata, which SGLang states in `output`; None if it is not stated."""
+    output = metadata.get("output")
+    rows = (output if isinstance(output, Mapping) else metadata).get("action_horizon")
+    return rows if type(rows) is int and rows > 0 else None
