@@ -162,7 +162,11 @@ def test_vllm_omni_needs_its_external_and_its_wrist_camera(replayed: Callable[..
 
 @pytest.mark.parametrize(
     ("mapping", "instruction"),
-    [({"cameras": NESTED, "instruction": "prompt"}, None), ({"instruction": "prompt"}, PROMPT)],
+    [
+        ({"cameras": NESTED, "instruction": "prompt"}, None),
+        ({"instruction": "prompt"}, PROMPT),
+        ({"cameras": {"front": "images"}, "instruction": "prompt"}, PROMPT),
+    ],
 )
 def test_flashrt_never_gets_an_observation_that_it_would_complete_itself(
     replayed: Callable[..., Upstream], mapping: dict[str, Any], instruction: str | None

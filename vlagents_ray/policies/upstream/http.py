@@ -170,7 +170,8 @@ class FlashRTClient(HttpClient):
     takes_key: ClassVar[bool] = False
 
     def encode(self, observation: Mapping[str, Any]) -> bytes:
-        images = list(observation.get("images", {}).values())
+        named = observation.get("images")
+        images = list(named.values()) if isinstance(named, Mapping) else []
         shapes = {image.shape for image in images}
         if len(shapes) != 1 or not observation.get("prompt"):
             raise InvalidObservation(
