@@ -72,7 +72,7 @@ class Runner:
                 self._record(name, {"figures": {}, "checks": [_unmet("runs", "no time was left", "it runs")]})
                 continue
             started = (name, self._start(name), time.monotonic())
-            if step.beside:
+            if step.beside in self._steps:
                 beside = started
                 continue
             self._finish(*started)

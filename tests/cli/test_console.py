@@ -16,7 +16,7 @@ from vlagents_ray.cli import console, listing
 from vlagents_ray.cli.console import PlainConsole, table
 from vlagents_ray.cli.main import envs, policies
 from vlagents_ray.envs.tabletop import Tabletop
-from vlagents_ray.registry import POLICIES
+from vlagents_ray.registry import POLICIES, WRAPPERS
 
 CLI = Path(console.__file__).parent
 CURE = "pip install 'vlagents-ray[libero]' [/] \\[red] and /a/very/long/path/" + "of-an-interpreter/" * 8 + "bin/python"
@@ -85,8 +85,7 @@ def test_a_listing_is_as_wide_as_a_terminal_and_has_a_line_for_each_elsewhere(sh
     if console.out.is_terminal:
         assert max(map(len, rows)) <= 80
     else:
-        assert len(rows) == 1 + len(POLICIES)
-        assert {row.split()[0] for row in rows[1:]} == POLICIES.keys()
+        assert sorted(row.split()[0] for row in rows[1:]) == sorted([*POLICIES, *WRAPPERS])
     assert "…" not in shown.getvalue()
 
 
@@ -129,7 +128,7 @@ def test_of_one_policy_all_is_said(shown: io.StringIO, monkeypatch: pytest.Monke
 def test_a_listing_is_json_for_programs(shown: io.StringIO) -> None:
     policies(as_json=True)
     found = {one["name"]: one for one in json.loads(shown.getvalue())}
-    assert found.keys() == POLICIES.keys()
+    assert found.keys() == {*POLICIES, *WRAPPERS}
     assert (found["noop"]["kind"], found["noop"]["missing"]) == ("policy", None)
     assert found["noop"]["details"][0] == "action_dim=7"
 

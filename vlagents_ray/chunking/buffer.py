@@ -186,7 +186,7 @@ class ChunkBuffer:
 
 _COLD = 2  # answers: the first ones that continue a plan run passes and sizes of batches that compile only then
 _RECENT = 10  # answers: at 10 ms to 1 s each, the estimate follows a slower network within seconds
-_QUANTILE = 0.9  # too short an estimate makes a jump, too long a one only a later reaction: so not the median
+_QUANTILE = 0.9  # too short an estimate makes a jump, one too long only a later reaction: so not the median
 
 
 class DelayEstimate:

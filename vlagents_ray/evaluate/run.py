@@ -25,7 +25,7 @@ from vlagents_ray.evaluate.results.statistics import Stopping
 from vlagents_ray.evaluate.results.store import Store
 from vlagents_ray.evaluate.results.summary import Summary, summarize, write_summary
 from vlagents_ray.evaluate.trackers import TrackerFeed
-from vlagents_ray.evaluate.workers.base import FailedAttempts, Workers, chosen_workers, dispatch
+from vlagents_ray.evaluate.workers.base import SIGNAL_S, FailedAttempts, Workers, chosen_workers, dispatch
 from vlagents_ray.evaluate.workers.in_process import workers_class
 from vlagents_ray.evaluate.workers.rollout import AgentFactory, OwnAgents, Report, agents, factory_program
 from vlagents_ray.ray_tools.signals import stop_signals
@@ -34,7 +34,6 @@ log = logging.getLogger(__name__)
 POLL_S = 0.25  # time after which a signal is handled
 MARGIN = 1.25  # assumed factor of the next episode over the longest so far
 CLOSING_S = 10.0  # for workers to close their simulators, and for the report to be written
-SIGNAL_S = 0.2  # s by which a signal may reach this process later than a worker
 
 
 class EvaluationInterrupted(KeyboardInterrupt):

@@ -418,7 +418,8 @@ def layers_of(cache: Any) -> list[tuple[Any, Any]]:
 
 def cache_of(layers: Sequence[Any]) -> Any:
     """Return a transformers `DynamicCache` with these keys and values, (B, 2, …) for each layer."""
-    from transformers import DynamicCache  # the compiler follows a statement, and not `require`
+    # The compiler follows a statement, and not `require`; nor does it follow the lazy module `transformers` itself.
+    from transformers.cache_utils import DynamicCache
 
     cache = DynamicCache()
     for number, layer in enumerate(layers):

@@ -86,6 +86,15 @@ def test_a_host_that_does_not_answer_is_waited_for_once(config: Config, monkeypa
     assert asked == ["host1", "host2"]
 
 
+def test_no_log_is_looked_for_once_the_head_is_gone_too(config: Config, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Ray's calls would block, and Slurm kills a cancelled job before its evaluation has written a summary."""
+    monkeypatch.setattr(pool, "tail_at", lambda *_: pytest.fail("asked a cluster that is gone"))
+    monkeypatch.setattr(pool, "head_is_gone", lambda: True)
+    failure = Failure("worker", EnvFailed.code, "the worker died")
+    with WorkerPool(config(), ToZero) as watched:
+        assert watched._with_log(failure, worker(config(), process={"host": "host1", "logs": ["/log"]})) == failure
+
+
 def test_a_worker_that_cannot_be_killed_saves_no_other_one(monkeypatch: pytest.MonkeyPatch) -> None:
     killed = []
 

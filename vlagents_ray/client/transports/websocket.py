@@ -213,14 +213,16 @@ class Stream:
 
     def _send_message(self, pieces: Sequence[Buffer], deadline: float) -> None:
         """Send a binary message in one frame (RFC 6455, 5.2), from the memory where its pieces are."""
-        pieces = [frame_head(sum(map(len, pieces)), _NO_MASK), *pieces]
+        size = sum(map(len, pieces))
+        head = frame_head(size, _NO_MASK)
+        pieces = [head, *pieces]
         if len(pieces) > _MOST_PIECES:
             pieces = [b"".join(pieces)]
         try:
             sent = self._socket.sendmsg(pieces)
         except BlockingIOError:
             sent = 0
-        if sent < sum(map(len, pieces)):
+        if sent < len(head) + size:
             self._send(memoryview(b"".join(pieces))[sent:], deadline)
 
     def _send(self, data: memoryview, deadline: float) -> None:

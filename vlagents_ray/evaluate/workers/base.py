@@ -20,6 +20,7 @@ from vlagents_ray.ray_tools.private import node_of_this_process
 
 SHORT_STEPS = 10_000  # planned steps up to which Ray's start, some seconds, is a large part of the time
 _STEPS = 300  # of an episode, if the options of its environment name no `max_steps`
+SIGNAL_S = 0.2  # s by which a signal may reach this process later than a worker
 VARIABLES = "env_vars"  # in Ray's runtime environment
 
 

@@ -8,7 +8,7 @@ import threading
 from collections import Counter
 from collections.abc import Iterator
 from dataclasses import replace
-from time import monotonic
+from time import monotonic, sleep
 from typing import Any
 
 import ray
@@ -22,10 +22,10 @@ from vlagents_ray.evaluate.episode.failures import Failure
 from vlagents_ray.evaluate.plan.cases import EvalCase
 from vlagents_ray.evaluate.plan.config import EvalConfig
 from vlagents_ray.evaluate.plan.jobs import Job
-from vlagents_ray.evaluate.workers.base import WorkerHandle, Workers
+from vlagents_ray.evaluate.workers.base import SIGNAL_S, WorkerHandle, Workers
 from vlagents_ray.evaluate.workers.cluster import CapacityMonitor, Placement, runtime_env, strategy, tail_at
 from vlagents_ray.evaluate.workers.rollout import AgentFactory, Heartbeat, Report, Rollout
-from vlagents_ray.ray_tools.head_monitor import HeadMonitor
+from vlagents_ray.ray_tools.head_monitor import HeadMonitor, head_is_gone
 
 WATCH_S = 1.0  # s between two queries of a busy worker, unless there are many
 QUERIES_PER_S = 250  # of all workers, at most: each takes the driver up to 1 ms
@@ -227,6 +227,11 @@ class WorkerPool(Workers):
         """Add the worker's log to the failure; a lost node is awaited only once, whatever its number of workers."""
         host: str = worker.process["host"]
         if monotonic() < self._unreachable.get(host, 0.0) or not self._head.answers():
+            return failure
+        sleep(SIGNAL_S)
+        if (
+            head_is_gone()
+        ):  # Slurm signals all of a job at once; Ray's calls would now block until it kills this process
             return failure
         try:
             return replace(failure, log=tail_at(host, worker.process["logs"]))
