@@ -20,7 +20,7 @@ import numpy as np
 import pytest
 from websockets.sync.server import serve
 
-from vlagents_ray.errors import ContractMismatch, PolicyFailed, VLAgentsError
+from vlagents_ray.errors import ContractMismatch, InvalidObservation, PolicyFailed, PolicyUnavailable
 from vlagents_ray.interface import Act, Obs
 from vlagents_ray.policies.upstream import Upstream
 
@@ -50,6 +50,10 @@ SETTINGS: dict[str, dict[str, Any]] = {
         "mapping": {"cameras": NESTED, "instruction": "prompt"},
     },
 }
+PATHS = {
+    "sglang_http": ("/v1/actions/metadata", "/v1/actions/generations"),
+    "flashrt_http": ("/health", "/predict"),
+}
 STATES = {"flashrt_http": np.zeros_like(STATE)}  # FlashRT's server reads none
 FAILING = [name for name in SETTINGS if name != "sglang_http"]  # the 500 of SGLang's HTTP is not made by its own code
 SEEN = Obs(dict(zip(("front", "wrist"), IMAGES.values(), strict=True)), state={"joints": STATE})
@@ -67,7 +71,7 @@ def replayed() -> Iterator[Callable[[str], Upstream]]:
     """A policy whose upstream is the recording of a name."""
     with ExitStack() as stack:
 
-        def make(name: str, **changes: Any) -> Upstream:
+        def make(name: str, *, closing: bool = False, prefix: str = "", **changes: Any) -> Upstream:
             metadata, answers = recorded(name)
 
             def websocket(connection: Any) -> None:
@@ -79,15 +83,17 @@ def replayed() -> Iterator[Callable[[str], Upstream]]:
                 protocol_version = "HTTP/1.1"
 
                 def do_GET(self) -> None:
-                    self._send(metadata if self.path in ("/health", "/v1/actions/metadata") else None)
+                    self._send(metadata if self.path == prefix + PATHS[name][0] else None)
 
                 def do_POST(self) -> None:
                     body = self.rfile.read(int(self.headers["Content-Length"]))
-                    self._send(answers[body] if self.path in ("/predict", "/v1/actions/generations") else None)
+                    self._send(answers[body] if self.path == prefix + PATHS[name][1] else None)
 
                 def _send(self, body: bytes | None) -> None:
                     self.send_response(404 if body is None else 422 if b"detail" in body else 200)
                     self.send_header("Content-Length", str(len(body or b"")))
+                    if closing:
+                        self.send_header("Connection", "close")
                     self.end_headers()
                     self.wfile.write(body or b"")
 
@@ -105,7 +111,7 @@ def replayed() -> Iterator[Callable[[str], Upstream]]:
             thread.start()
             stack.callback(thread.join)
             stack.callback(server.shutdown)
-            [path] = SETTINGS[name]["urls"]
+            path = prefix + PATHS[name][1] if prefix else SETTINGS[name]["urls"][0]
             url = f"{'http' if is_http else 'ws'}://127.0.0.1:{port}{path}"
             config = SETTINGS[name] | {"urls": [url], "connect_timeout_s": 5, "retry_s": 30} | changes
             return stack.enter_context(Upstream.from_config(config))
@@ -160,18 +166,56 @@ def test_vllm_omni_needs_its_external_and_its_wrist_camera(replayed: Callable[..
         replayed("vllm_omni_websocket", mapping=mapping).initialize()
 
 
+CAMERAS = SETTINGS["flashrt_http"]["mapping"]["cameras"]
+
+
 @pytest.mark.parametrize(
-    ("mapping", "instruction"),
+    ("mapping", "said"),
     [
-        ({"cameras": NESTED, "instruction": "prompt"}, None),
-        ({"instruction": "prompt"}, PROMPT),
-        ({"cameras": {"front": "images"}, "instruction": "prompt"}, PROMPT),
+        ({"instruction": "prompt"}, r"cameras: got \[\], want images/NAME for each"),
+        ({"cameras": {"front": "images"}, "instruction": "prompt"}, r"cameras: got \['front'\]"),
+        ({"cameras": CAMERAS | {"front": {"key": "images/f", "optional": True}}}, r"cameras: got \['front'\]"),
+        ({"cameras": CAMERAS, "instruction": "task"}, "instruction: got 'task', want 'prompt'"),
     ],
 )
-def test_flashrt_never_gets_an_observation_that_it_would_complete_itself(
-    replayed: Callable[..., Upstream], mapping: dict[str, Any], instruction: str | None
+def test_flashrt_does_not_start_with_a_mapping_that_it_would_complete_itself(
+    replayed: Callable[..., Upstream], mapping: dict[str, Any], said: str
 ) -> None:
-    agent = replayed("flashrt_http", mapping=mapping)
+    with pytest.raises(ContractMismatch, match=said):
+        replayed("flashrt_http", mapping=mapping).initialize()
+
+
+@pytest.mark.parametrize(
+    ("obs", "instruction"), [(SEEN, None), (Obs(SEEN.cameras | {"front": np.zeros((4, 4, 3), np.uint8)}), PROMPT)]
+)
+def test_flashrt_never_gets_an_observation_that_it_would_complete_itself(
+    replayed: Callable[..., Upstream], obs: Obs, instruction: str | None
+) -> None:
+    agent = replayed("flashrt_http")
     agent.initialize()
-    with pytest.raises(VLAgentsError, match="map cameras to images/NAME and the instruction to prompt"):
-        raise act(agent, instruction)  # type: ignore[misc]
+    assert isinstance(error := act(agent, instruction, obs), InvalidObservation)
+    assert "want images of one shape and a prompt" in str(error)
+
+
+@pytest.mark.parametrize("name", ["sglang_websocket", "sglang_http"])
+def test_a_camera_that_sglang_would_ignore_does_not_start(replayed: Callable[..., Upstream], name: str) -> None:
+    mapping = SETTINGS[name]["mapping"]
+    only_front = mapping | {"cameras": {"front": mapping["cameras"]["front"]}}
+    replayed(name, mapping=only_front).initialize()  # a robot without a camera at its wrist
+    misspelt = mapping | {"cameras": {"front": mapping["cameras"]["front"].replace("rgb", "bgr")}}
+    with pytest.raises(ContractMismatch, match=r"reads \['base_0_rgb', 'left_wrist_0_rgb'\], the mapping gives"):
+        replayed(name, mapping=misspelt).initialize()
+
+
+def test_an_upstream_that_closes_each_connection_or_has_a_prefix_is_used(replayed: Callable[..., Upstream]) -> None:
+    for agent in (replayed("sglang_http", closing=True), replayed("sglang_http", prefix="/robot/1")):
+        agent.initialize()
+        assert isinstance(act(agent, PROMPT), Act)
+
+
+def test_an_error_over_http_states_the_status_and_the_place_of_the_text(replayed: Callable[..., Upstream]) -> None:
+    agent = replayed("flashrt_http")
+    agent.initialize()
+    assert "it answered with HTTP 422, whose text the server's log has" in str(act(agent, "fail"))
+    with pytest.raises(PolicyUnavailable, match=r"HTTP 404, .*; want its metadata at /v1/actions/metadata"):
+        replayed("flashrt_http", protocol="sglang", connect_timeout_s=0.2).initialize()

@@ -6,6 +6,7 @@ import abc
 import base64
 import http.client
 import json
+import re
 import select
 import socket
 import ssl
@@ -15,16 +16,10 @@ from urllib.parse import urlsplit
 
 import numpy as np
 
-from vlagents_ray.errors import (
-    ConnectionLost,
-    InvalidObservation,
-    MalformedMessage,
-    MessageTooLarge,
-    PolicyUnavailable,
-    VLAgentsError,
-)
-from vlagents_ray.policies.upstream.client import Answer, ClientOptions, UpstreamClient, stated_rows
+from vlagents_ray.errors import ConnectionLost, InvalidObservation, MessageTooLarge, PolicyUnavailable, VLAgentsError
+from vlagents_ray.policies.upstream.client import Answer, ClientOptions, UpstreamClient
 from vlagents_ray.wire import json_numpy, openpi, openvla
+from vlagents_ray.wire.outgoing import Outgoing
 
 _BUSY = (408, 429, 502, 503, 504)
 
@@ -66,6 +61,20 @@ class HttpClient(UpstreamClient):
         return not ended.poll(0)
 
     def connect(self, timeout_s: float) -> dict[str, Any]:
+        metadata: Any = {}
+        if self.about is not None:
+            self._open(timeout_s)
+            path = f"{self._path.removesuffix(self.path)}{self.about}"
+            try:
+                metadata = json_numpy.loads(self._request("GET", path, None), self.options.limits)
+            except VLAgentsError as error:
+                raise PolicyUnavailable(f"{error}; want its metadata at {path}") from error
+            finally:
+                self.close()  # the upstream may have closed the connection
+        self._open(timeout_s)
+        return metadata if isinstance(metadata, dict) else {}
+
+    def _open(self, timeout_s: float) -> None:
         secure = self._url.scheme == "https"
         kind = http.client.HTTPSConnection if secure else http.client.HTTPConnection
         connection = kind(self._url.hostname or "", self._url.port, timeout=timeout_s)
@@ -78,14 +87,6 @@ class HttpClient(UpstreamClient):
         connection.sock.settimeout(self.options.timeout_s)
         connection.auto_open = 0
         self._connection = connection
-        if self.about is None:
-            return {}
-        try:
-            metadata = json_numpy.loads(self._request("GET", self.about, None), self.options.limits)
-        except VLAgentsError as error:
-            self.close()
-            raise PolicyUnavailable(f"{error}; want its metadata at {self.about}") from error
-        return metadata if isinstance(metadata, dict) else {}
 
     def ask(self, observations: Sequence[Mapping[str, Any]]) -> list[Answer]:
         [observation] = observations
@@ -109,7 +110,7 @@ class HttpClient(UpstreamClient):
         if response.status in _BUSY:
             raise ConnectionLost(f"upstream {self.options.url}: it answered with HTTP {response.status}")
         if response.status != http.HTTPStatus.OK:
-            raise self.failed(f"HTTP {response.status}: {body[:2000]!r}")
+            raise self.failed(body[:2000], f"HTTP {response.status}")
         return body
 
     def close(self) -> None:
@@ -154,36 +155,42 @@ class SGLangClient(HttpClient):
             raise self.unreadable(type(actions).__name__, "a map with an array `actions`")
         return actions
 
-    def chunk(self, metadata: Mapping[str, Any]) -> int | None:
-        return stated_rows(metadata)
-
 
 class FlashRTClient(HttpClient):
     """A client of FlashRT's `/predict`: images without names in base64, in the order of the mapping.
 
-    An observation without images or a prompt is refused, for which the server would draw random images, or use the last
-    prompt of any client.
+    Without images the server draws random ones, without a prompt it uses the last one of any client, and if an image is
+    missing, the next one takes its place. So a mapping of which one may be missing is refused.
     """
 
     path: ClassVar[str] = "/predict"
     about: ClassVar[str | None] = "/health"
     takes_key: ClassVar[bool] = False
 
+    def differences(self, metadata: Mapping[str, Any], outgoing: Outgoing) -> list[str]:
+        cameras, found = outgoing.mapping.cameras, []
+        unfit = [name for name, one in cameras.items() if one.optional or not re.fullmatch(r"images/[^/|*]+", one.key)]
+        if unfit or not cameras:
+            found.append(f"cameras: got {unfit}, want images/NAME for each, none optional; change mapping.cameras")
+        if (text := outgoing.mapping.instruction) != "prompt":
+            found.append(f"instruction: got {text!r}, want 'prompt'; change mapping.instruction")
+        return found
+
     def encode(self, observation: Mapping[str, Any]) -> bytes:
-        named = observation.get("images")
-        images = list(named.values()) if isinstance(named, Mapping) else []
-        shapes = {image.shape for image in images}
+        images = list(observation["images"].values())
+        shapes = sorted({image.shape for image in images})
         if len(shapes) != 1 or not observation.get("prompt"):
             raise InvalidObservation(
-                f"flashrt: got images of {sorted(shapes)} and the keys {sorted(observation)}, want one shape and a "
-                f"prompt; map cameras to images/NAME and the instruction to prompt"
+                f"flashrt: got images of {shapes} and the keys {sorted(observation)}, want images of one shape and a "
+                f"prompt; resize them, and reset with an instruction"
             )
         body = {name: value.tolist() if isinstance(value, np.ndarray) else value for name, value in observation.items()}
         body["images"] = [base64.b64encode(image.tobytes()).decode() for image in images]
-        return json.dumps(body | {"image_shape": images[0].shape}).encode()
+        return json.dumps(body | {"image_shape": shapes[0]}).encode()
 
     def decode(self, body: bytes) -> np.ndarray:
         reply = json_numpy.loads(body, self.options.limits)
-        if not isinstance(reply, dict) or not isinstance(reply.get("actions"), list):
-            raise MalformedMessage(f"upstream {self.options.url}: got {type(reply).__name__}, want a list `actions`")
-        return json_numpy.rows(reply["actions"])
+        actions = reply.get("actions") if isinstance(reply, dict) else None
+        if not isinstance(actions, list):
+            raise self.unreadable(type(actions).__name__, "a map with a list `actions`")
+        return json_numpy.rows(actions)

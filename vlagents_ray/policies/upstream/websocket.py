@@ -17,7 +17,7 @@ from websockets.protocol import State
 from websockets.sync.client import ClientConnection, connect
 
 from vlagents_ray.errors import PolicyUnavailable, Unauthorized, VLAgentsError
-from vlagents_ray.policies.upstream.client import Answer, ClientOptions, UpstreamClient, stated_rows
+from vlagents_ray.policies.upstream.client import Answer, ClientOptions, UpstreamClient
 from vlagents_ray.wire import openpi, vla_eval
 from vlagents_ray.wire.outgoing import Outgoing
 
@@ -144,10 +144,6 @@ class OpenPiClient(WebSocketClient):
         if isinstance(reply, dict) and reply.get("type") == "error":
             raise self.failed(reply.get("message"))
         return reply
-
-    def chunk(self, metadata: Mapping[str, Any]) -> int | None:
-        """Return the number of rows that SGLang's and vLLM-Omni's metadata state."""
-        return stated_rows(metadata)
 
     def _actions(self, reply: Any) -> np.ndarray:
         actions = reply.get("actions") if isinstance(reply, dict) else None
