@@ -63,7 +63,8 @@ TORCH_FROM := $(if $(TORCH_INDEX_URL),--index-url $(TORCH_INDEX_URL))
 
 setup: $(STAMP)
 
-demo: setup
+# A part of the environment is enough; `make setup` installs the rest into the same folder.
+demo: $(if $(wildcard $(STAMP)),$(STAMP),$(VENV)/.demo)
 	$(BIN)/vlagents-ray demo
 
 # The reference policy from nothing in runs/reference, in two hours; an interrupted one continues.
@@ -195,6 +196,11 @@ $(STAMP): pyproject.toml $(CONSTRAINTS)
 	@echo '== installing vlagents-ray into $(VENV)'
 	$(PIP) install --quiet --constraint $(CONSTRAINTS) --editable '.[dev]'
 	$(PIP) check
+	@touch $@
+
+$(VENV)/.demo: pyproject.toml $(CONSTRAINTS)
+	@echo '== installing what the demo needs into $(VENV)'
+	$(PIP) install --quiet --constraint $(CONSTRAINTS) --editable '.[sim]'
 	@touch $@
 
 # What a server installs; as old as its last change, whatever else changes in pyproject.toml.

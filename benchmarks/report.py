@@ -347,7 +347,7 @@ def _skipped(results: Mapping[str, Any]) -> Iterator[str]:
     for part in ("rtt", "link", *THROUGHPUTS, "evaluation"):
         found |= (results.get(part) or {}).get("skipped", {})
     for name, reason in found.items():
-        yield f"{name} ({reason})"
+        yield f"{name} ({reason.partition(';')[0]})"  # without the cure
 
 
 def _table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:

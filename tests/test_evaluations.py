@@ -26,7 +26,8 @@ MODELS = [
 ]  # fmt: skip
 CAMERAS = {"libero": {"front", "wrist"}, "simpler": {"3rd_view_camera"}, "tabletop": {"front"}}
 # Of models that are not told which camera is which.
-WITHOUT_WORDS = {"openpi": {"image": "front", "wrist_image": "wrist"}, "openvla": {"image": "front"}, "lerobot": {}}
+WITHOUT_WORDS = {"openpi": {"image": "front", "wrist_image": "wrist"}, "openvla": {"image": "front"}, "lerobot": {},
+                 "reference": {"front": "front", "wrist": "wrist"}}  # fmt: skip
 ELSEWHERE = {
     ("EvalConfig", "out"),
     ("EvalConfig", "worker"),
@@ -56,7 +57,11 @@ def test_a_model_of_an_example_looks_through_cameras_that_its_envs_have(
 ) -> None:
     monkeypatch.chdir(ROOT)
     config = EvalConfig.model_validate(read_run(file))
-    have = [CAMERAS[env.partition("/")[0]] for suite in config.suites for env in suite.envs]
+    have = [
+        set(suite.env_options.get("cameras") or CAMERAS[env.partition("/")[0]])
+        for suite in config.suites
+        for env in suite.envs
+    ]
     for policy in config.policies:
         if policy.source is None or not policy.source.endswith(".yaml"):
             continue

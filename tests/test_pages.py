@@ -39,6 +39,7 @@ RUN = {"vlagents-ray doctor", "vlagents-ray policies"}
 # and these are not.
 NOT_RUN = {
     "vlagents-ray envs": "a block of docs/evaluation/index.md runs it",
+    "vlagents-ray serve noop --port 8000": "test_served_pages.py serves so what blocks of this page need",
     "vlagents-ray slurm eval": "the name of a command",
     "vlagents-ray robot --env tabletop --leader keyboard": "tests/cli/test_robot.py types its keys",
     "vlagents-ray serve my_policies:Reach --set gain=0.3": "test_served_pages.py serves examples/own_policy.py so",
@@ -99,7 +100,7 @@ def test_commands_of_the_readme_that_are_not_run_exist() -> None:
 
 
 def test_the_readme_is_one_that_is_read() -> None:
-    assert len(README.read_text().splitlines()) <= 200
+    assert len(README.read_text().splitlines()) <= 140
     assert {block.language for page, block in BLOCKS if page == README} == {"python", "bash"}
 
 

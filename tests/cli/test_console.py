@@ -11,10 +11,11 @@ from pathlib import Path
 
 import pytest
 import typer
+from typer.testing import CliRunner
 
 from vlagents_ray.cli import console, listing
 from vlagents_ray.cli.console import PlainConsole, table
-from vlagents_ray.cli.main import envs, policies
+from vlagents_ray.cli.main import app, envs, policies
 from vlagents_ray.envs.tabletop import Tabletop
 from vlagents_ray.registry import POLICIES, WRAPPERS
 
@@ -159,3 +160,10 @@ def test_a_command_loads_neither_ray_nor_torch_unasked_and_ends_without_looking_
     )
     ran = subprocess.run([sys.executable, "-c", code], check=True, capture_output=True, text=True, timeout=120)
     assert ran.stdout.splitlines()[-1] == "True set()"
+
+
+def test_all_commands_are_on_one_screen() -> None:
+    said = CliRunner().invoke(app, ["--help"], env={"COLUMNS": "80", "TERMINAL_WIDTH": "80"}).output
+    names = re.findall(r"^│ ([a-z]\w*)  ", said, re.MULTILINE)
+    assert names[:5] == ["serve", "eval", "robot", "demo", "doctor"]
+    assert len(said.splitlines()) <= len(names) + 15  # no text needs a second line

@@ -1,7 +1,7 @@
 """Reading, running and checking the fenced blocks of a Markdown text, its commands, and the files of examples/.
 
 An HTML comment straight above a block says how it is tested. `<!-- test: serve scripted -->` runs it
-with a server of that policy in place of http://gpu-box:8000, `<!-- test -->` or no comment without
+with a server of that policy in place of http://gpu-box:8000 or http://localhost:8000, `<!-- test -->` or no comment without
 one; ` with peers` at the end of either runs it with the Python that has other systems' clients, and
 ` with ray` says of a block of docs/ that it starts Ray.
 Further lines of such a comment are code that is run before the block:
@@ -36,6 +36,7 @@ from vlagents_ray.cli.main import app
 
 ROOT = Path(__file__).parents[2]
 DOCUMENTED_HOST = "gpu-box:8000"
+ON_THIS_MACHINE = "localhost:8000"
 PYTHON, SHELL = {"python"}, {"bash", "sh", "console"}
 # As a reader has it, without PYTHONPATH; but if that names this checkout, another one may be what is installed.
 _HERE = {"PYTHONPATH": str(ROOT)} if str(ROOT) in os.environ.get("PYTHONPATH", "").split(os.pathsep) else {}
@@ -130,6 +131,8 @@ def checkout(folder: Path) -> None:
 def run(block: Block, cwd: Path, host: str = DOCUMENTED_HOST, *, page: str = "README") -> None:
     """Run the block in `cwd`; a failure shows the page's own line numbers."""
     source = block.source.replace(DOCUMENTED_HOST, host) + "\n"
+    if block.server:
+        source = source.replace(ON_THIS_MACHINE, host)
     if block.file is not None:
         (cwd / block.file).write_text(source.lstrip())
         return

@@ -115,17 +115,12 @@ def ways() -> Iterator[str]:
 
 _RAPTOR = f"a recurrent policy for quadrotors by its authors' weights, in 58 lines | PyPI | {verified('RAPTOR')}"
 _OWN_POLICY = "a class with `initialize`, `reset` and `act` | `vlagents-ray new policy NAME` | "
-_OWN_ENV = "a subclass of `EvalEnv` | `vlagents-ray new env NAME` | "
 TABLES: dict[str, dict[str, list[str]]] = {
     "README.md": {
         "policies": [
             *policies("docs/policies/"),
             f"| [RAPTOR](docs/tutorials/raptor.md) | {_RAPTOR} |",
             f"| [your own](docs/own_policy.md) | {_OWN_POLICY} |",
-        ],
-        "environments": [
-            *environments("docs/benchmarks/"),
-            f"| [your own](docs/benchmarks/index.md#an-environment-of-your-own) | {_OWN_ENV} |",
         ],
     },
     "docs/policies/index.md": {"policies": list(policies())},

@@ -33,10 +33,22 @@ app = typer.Typer(
     help="Serve Vision-Language-Action models with Ray, and evaluate them in parallel simulation.",
 )
 env = typer.Typer(no_args_is_help=True, help="Python environments for policies that the server's own does not suit.")
+_MORE = "More commands"
 app.command("serve")(serve_command)
+app.command("eval", short_help="Evaluate policies in parallel: success with intervals, videos.")(evaluate_command)
 
 
-@app.command()
+@app.command(
+    "robot", add_help_option=False, context_settings={"allow_extra_args": True, "ignore_unknown_options": True}
+)
+def robot_command(context: typer.Context) -> None:
+    """Drive a robot or a simulation by a policy, an operator, or both."""
+    from vlagents_ray.cli.robot import main
+
+    raise typer.Exit(main(context.args))
+
+
+@app.command(short_help="Try it in a minute: serve a policy, evaluate it, record videos.")
 def demo(out_dir: Annotated[Path, typer.Option("--out", help="Folder of the results.")] = Path("runs/demo")) -> None:
     """Try it in a minute: serve a policy, evaluate it on the tabletop, record videos.
 
@@ -59,31 +71,38 @@ def demo(out_dir: Annotated[Path, typer.Option("--out", help="Folder of the resu
         run_evaluation(EvalConfig(policies=[policy], suites=[suite], workers=2, video="all", out=fresh(out_dir)))
 
 
-app.command("bundle")(results.bundle_command)
-app.command("eval")(evaluate_command)
-app.command("export")(results.export_command)
-app.command("merge")(results.merge_command)
-app.command("replay")(results.replay_command)
-app.command("report")(results.report_command)
-app.command("tune")(tune_command)
-app.command("verify")(results.verify_command)
-app.add_typer(env, name="env")
-app.add_typer(keys, name="keys")
-app.add_typer(new, name="new")
-app.add_typer(slurm, name="slurm")
+@app.command(short_help="Check this machine: Python, Ray, GPU, ports; each with the cure.")
+def doctor(
+    port: Annotated[int, typer.Option(help="The port that a server would take.")] = 8000,
+    python: Annotated[list[Path], typer.Option(help="A policy's Python, repeatable; default: in .venv-*.")] = [],  # noqa: B006
+) -> None:
+    """Check this machine: Python, Ray, GPU, torch, JAX, rendering, shared memory, ports; each with the cure."""
+    from vlagents_ray.cli.doctor import run
+
+    raise typer.Exit(run(out, port, python))
 
 
-@app.command(
-    "robot", add_help_option=False, context_settings={"allow_extra_args": True, "ignore_unknown_options": True}
-)
-def robot_command(context: typer.Context) -> None:
-    """Drive a robot, or a simulation, by a policy, by an operator, or by a policy that an operator corrects."""
-    from vlagents_ray.cli.robot import main
+# With lines that fit into 80 columns, so that all commands are on one screen.
+for _command, _name, _line in (
+    (results.report_command, "report", "Write the report of an evaluation again."),
+    (results.export_command, "export", "Write episodes as JSON, CSV, Parquet or a LeRobotDataset."),
+    (results.merge_command, "merge", "Merge results: each episode once, by its key."),
+    (results.replay_command, "replay", "Play an episode or a dataset again, and compare actions."),
+    (results.bundle_command, "bundle", "Write an evaluation as one file that others can verify."),
+    (results.verify_command, "verify", "Check a bundle, and print what is equal or differs."),
+    (tune_command, "tune", "Find the best batch size, compilation and precision."),
+):
+    app.command(_name, short_help=_line, rich_help_panel=_MORE)(_command)
+for _commands, _name, _line in (
+    (env, "env", "Make Python environments for policies."),
+    (keys, "keys", "Make, list and revoke the API keys of a server."),
+    (new, "new", "Write a working skeleton, with its test."),
+    (slurm, "slurm", "Submit evaluations and servers as Slurm jobs."),
+):
+    app.add_typer(_commands, name=_name, short_help=_line, rich_help_panel=_MORE)
 
-    raise typer.Exit(main(context.args))
 
-
-@app.command()
+@app.command(short_help="List policies and wrappers, and how to install them.", rich_help_panel=_MORE)
 def policies(name: OneName = None, as_json: AsJson = False) -> None:
     """List policies and wrappers: their models, whether their packages are installed, and installation commands."""
     from vlagents_ray.cli.listing import policies_and_wrappers
@@ -91,7 +110,7 @@ def policies(name: OneName = None, as_json: AsJson = False) -> None:
     _list(list(policies_and_wrappers()), name, as_json=as_json)
 
 
-@app.command()
+@app.command(short_help="List environments, and how to install them.", rich_help_panel=_MORE)
 def envs(name: OneName = None, as_json: AsJson = False) -> None:
     """List the environments: their tasks, whether they run here, and installation commands."""
     from vlagents_ray.cli.listing import environments
@@ -122,17 +141,6 @@ def _list(listed: Sequence[Listed], name: str | None, *, as_json: bool) -> None:
         out.print(f"\nfor the rest{', whose Python a deployment names as `environment`' * made}:")
     for line in cures:
         out.print(f"  {line}")
-
-
-@app.command()
-def doctor(
-    port: Annotated[int, typer.Option(help="The port that a server would take.")] = 8000,
-    python: Annotated[list[Path], typer.Option(help="A policy's Python, repeatable; default: in .venv-*.")] = [],  # noqa: B006
-) -> None:
-    """Check this machine: Python, Ray, GPU, torch, JAX, rendering, shared memory, ports; each with the cure."""
-    from vlagents_ray.cli.doctor import run
-
-    raise typer.Exit(run(out, port, python))
 
 
 @env.callback()
