@@ -117,7 +117,7 @@ POLICIES: dict[str, Adapter] = {
     ),
     "upstream": Adapter(
         "vlagents_ray.policies.upstream:Upstream",
-        "any model behind a server of openpi, RoboArena, GR00T, OpenVLA, vla-eval or vlagents",
+        "any model behind openpi, RoboArena, GR00T, OpenVLA, vla-eval, vlagents, SGLang, vLLM-Omni or FlashRT",
         wants="that server",
     ),
     "noop": Adapter("vlagents_ray.policies.noop:Noop"),
