@@ -101,9 +101,10 @@ def test_a_killed_replica_costs_no_flight(server: Server, transport: TransportNa
         for i, row in enumerate(inputs[:300, 0]):
             if i == 200:
                 os.kill(pid, signal.SIGKILL)
-                wait_for(lambda: not psutil.pid_exists(pid))
+                wait_for(lambda pid=pid: not psutil.pid_exists(pid))
             act = agent.act(observation(row))
             assert ("resumed" in act.info) == (i == 200), i
+            pid = act.info["pid"]
             assert np.abs(act.action - wanted[i, 0]).max() < TOLERANCE, i
 
 
@@ -112,7 +113,7 @@ def test_a_killed_replica_is_an_error_where_sessions_are_not_resumed(server: Ser
     with client(server, "websocket", resume=False) as agent:
         pid = agent.reset(START)["pid"]
         os.kill(pid, signal.SIGKILL)
-        wait_for(lambda: not psutil.pid_exists(pid))
+        wait_for(lambda pid=pid: not psutil.pid_exists(pid))
         with pytest.raises(ConnectionLost):
             agent.act(START)
 

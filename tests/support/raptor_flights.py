@@ -18,11 +18,14 @@ Acts = Callable[[Sequence[Obs]], Sequence[Act]]
 
 
 class LocatedRaptor(Raptor):
-    """States its process at each reset, for tests that kill it."""
+    """States its process at each reset and act, for tests that kill it: a session may have moved since its reset."""
 
     def reset(self, obs: Obs, instruction: str | None, **kwargs: Any) -> dict[str, Any]:
         super().reset(obs, instruction, **kwargs)
         return {"pid": os.getpid()}
+
+    def act_batch(self, obs: Sequence[Obs], sessions: Sequence[Any]) -> list[Act]:
+        return [Act(act.action, info={"pid": os.getpid()}) for act in super().act_batch(obs, sessions)]
 
 
 def reference() -> tuple[np.ndarray, np.ndarray]:
