@@ -12,6 +12,7 @@ import pytest
 import yaml
 from ray.serve.schema import ServeApplicationSchema
 from readme_blocks import PAGES, commands, read_as_typed
+from tables import section
 
 from vlagents_ray.cli.evaluate import read_run
 from vlagents_ray.envs import aloha, calvin, metaworld, robocasa
@@ -105,18 +106,17 @@ def test_files_of_runs_on_the_pages_are_accepted() -> None:
 @pytest.mark.parametrize(
     ("page", "protocol"),
     [
-        ("metaworld", metaworld.PROTOCOL),
-        ("aloha", aloha.PROTOCOL),
-        ("pusht", known("gym_pusht/PushT-v0").protocol),
-        ("gymnasium", known("FetchReach-v4").protocol),
-        ("robosuite", TASKS["Lift"].protocol),
+        ("gymnasium#meta-world", metaworld.PROTOCOL),
+        ("gymnasium#aloha", aloha.PROTOCOL),
+        ("gymnasium#pusht", known("gym_pusht/PushT-v0").protocol),
+        ("gymnasium#fetch-gymnasium-robotics", known("FetchReach-v4").protocol),
+        ("robosuite#robosuite", TASKS["Lift"].protocol),
         ("calvin", calvin.PROTOCOL),
-        ("robocasa", robocasa.protocol("OpenDrawer", "target")),
+        ("robosuite#robocasa", robocasa.protocol("OpenDrawer", "target")),
     ],
 )
 def test_a_benchmarks_page_states_the_protocol_that_is_recorded(page: str, protocol: BenchmarkProtocol) -> None:
-    text = (DOCS / "benchmarks" / f"{page}.md").read_text()
-    rows = dict(re.findall(r"^\| (\w+) \| (.*) \|$", text, re.MULTILINE))
+    rows = dict(re.findall(r"^\| (\w+) \| (.*) \|$", section("benchmarks", page), re.MULTILINE))
     assert re.match(r"\d+", rows["steps"]).group() == str(protocol.max_steps)  # type: ignore[union-attr]
     assert rows["rate"] == f"{protocol.control_hz:g} Hz"
     assert ("ends the episode" in rows["success"]) is protocol.ends_on_success

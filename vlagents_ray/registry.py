@@ -154,12 +154,14 @@ ENVS: dict[str, Adapter] = {
         "SIMPLER's Bridge twins",
         extra="maniskill",
         wants="assets",
+        page="maniskill#simpler",
     ),
     "metaworld": Adapter(
         "vlagents_ray.envs.metaworld:MetaWorld",
         "Meta-World's 50 tasks",
         needs=("metaworld",),
         extra="metaworld",
+        page="gymnasium#meta-world",
     ),
     "robosuite": Adapter(
         "vlagents_ray.envs.robosuite:Robosuite",
@@ -181,6 +183,7 @@ ENVS: dict[str, Adapter] = {
         needs=("robocasa",),
         requirements=("robocasa",),
         wants="assets",
+        page="robosuite#robocasa",
     ),
     "rcs": Adapter(
         "vlagents_ray.envs.rcs:Rcs",
@@ -203,6 +206,7 @@ ENVS: dict[str, Adapter] = {
         "ALOHA's two simulated tasks, for two arms",
         needs=("gym_aloha", "dm_control"),
         extra="aloha",
+        page="gymnasium#aloha",
     ),
     "pusht": Adapter(
         "vlagents_ray.envs.gymnasium:PushT",
@@ -210,6 +214,7 @@ ENVS: dict[str, Adapter] = {
         needs=("gym_pusht", "shapely"),
         extra="pusht",
         tasks="",
+        page="gymnasium#pusht",
     ),
     "gymnasium": Adapter(
         "vlagents_ray.envs.gymnasium:Gymnasium",

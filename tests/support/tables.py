@@ -42,6 +42,18 @@ def page_of(name: str, one: Adapter) -> str:
     return name if one.page is None else one.page.partition("#")[0]
 
 
+def section(folder: str, page: str) -> str:
+    """Return the text of a page of docs/, given as `page` or, for one section of it, as `page#anchor`."""
+    name, _, anchor = page.partition("#")
+    text = (ROOT / "docs" / folder / f"{name}.md").read_text()
+    if not anchor:
+        return text
+    for part in re.split(r"^(?=## )", text, flags=re.MULTILINE):
+        if re.sub(r"[^\w-]", "", part.partition("\n")[0][3:].lower().replace(" ", "-")) == anchor:
+            return part
+    raise ValueError(f"docs/{folder}/{name}.md: got no heading of the second level for #{anchor}")
+
+
 def share(solved: int, episodes: int, digits: int = 0) -> str:
     """Return a rate of success in per cent, with its interval."""
     values = (solved / episodes, *wilson(solved, episodes))
