@@ -93,7 +93,7 @@ def test_the_file_of_runs_behind_the_reports_picture_is_accepted() -> None:
 
 
 def test_files_of_runs_on_the_pages_are_accepted() -> None:
-    others = [DOCS / "cluster" / "placement.md", DOCS / "evaluation" / "robot.md"]
+    others = [DOCS / "cluster" / "scaling.md", DOCS / "evaluation" / "robot.md"]
     pages = [*sorted((DOCS / "benchmarks").glob("*.md")), *others]
     blocks = [
         block for page in pages for block in re.findall(r"```yaml\n(policies:.*?)```", page.read_text(), re.DOTALL)
