@@ -43,7 +43,8 @@ _OVER_THE_LINK = {
     "*vlagents, JPEG*": "*vlagents JPEG*",
     "*openpi*": "*openpi*",
 }
-BLOCKS = re.findall(r"```yaml\n(.*?)```", (DOCS / "environments.md").read_text(), re.DOTALL)
+_ENVIRONMENTS = (DOCS / "serving.md").read_text().partition("\n## Python environments\n")[2]
+BLOCKS = re.findall(r"```yaml\n(applications:.*?)```", _ENVIRONMENTS, re.DOTALL)
 
 
 @pytest.mark.parametrize("block", BLOCKS)
@@ -176,6 +177,7 @@ def test_every_page_stands_in_the_navigation_of_the_site() -> None:
     pages = {str(page.relative_to(DOCS)) for page in DOCS.rglob("*.md")}
     outside = {page.name for page in ROOT.glob("*.md")} | {"examples/README.md", "examples/experts/README.md"}
     assert pages == navigation - outside
+    assert len(pages) <= 60, "a reader looks for a subject: extend the page that has it"
 
 
 @pytest.mark.parametrize("page", [*ROOT.glob("*.md"), *DOCS.rglob("*.md")], ids=lambda page: page.name)

@@ -36,7 +36,7 @@ class Adapter:
     checkouts: tuple[str, ...] = ()  # variables, one of which names a checkout of the authors' code
     wants: str = ""  # further requirements of its users, such as "assets"
     tasks: str = "/<task>"  # of an environment: the pattern after its name
-    page: str | None = None  # below docs/policies or docs/benchmarks, "" for no page; None: the page with its name
+    page: str | None = None  # below docs/policies or docs/benchmarks, "page#section"; "": none; None: its own name
 
 
 POLICIES: dict[str, Adapter] = {
@@ -66,6 +66,7 @@ POLICIES: dict[str, Adapter] = {
         needs=("openpi", "jax", "flax", "transformers", "torch"),
         requirements=("openpi",),
         checkouts=("OPENPI_SRC",),
+        page="pi0#openpi",
     ),
     "openvla": Adapter(
         "vlagents_ray.policies.openvla.policy:OpenVLA",
@@ -88,6 +89,7 @@ POLICIES: dict[str, Adapter] = {
         needs=("octo", "jax", "flax", "transformers"),
         requirements=("octo",),
         checkouts=("OCTO_SRC",),
+        page="other#octo",
     ),
     "diffusion_policy": Adapter(
         "vlagents_ray.policies.diffusion_policy:DiffusionPolicy",
@@ -95,6 +97,7 @@ POLICIES: dict[str, Adapter] = {
         needs=("diffusion_policy", "torch", "diffusers", "dill", "omegaconf"),
         requirements=("diffusion_policy",),
         checkouts=("DIFFUSION_POLICY_SRC",),
+        page="other#diffusion-policy",
     ),
     "vjepa2_ac": Adapter(
         "vlagents_ray.policies.vjepa2_ac:VJepa2Ac",
@@ -102,6 +105,7 @@ POLICIES: dict[str, Adapter] = {
         needs=("src", "transformers", "torch", "timm"),
         requirements=("hf",),
         checkouts=("VJEPA2_SRC",),
+        page="other#v-jepa-2-ac",
     ),
     "onnx": Adapter(
         "vlagents_ray.policies.onnx:Onnx",

@@ -11,7 +11,7 @@ import re
 from collections.abc import Iterable, Iterator
 from pathlib import Path
 
-from verified import marked, notes
+from verified import RUN_WITH, marked, notes
 
 from vlagents_ray.evaluate.results.statistics import wilson
 from vlagents_ray.registry import ENVS, POLICIES, Adapter
@@ -20,7 +20,6 @@ ROOT = Path(__file__).parents[2]
 RATES = json.loads((ROOT / "tests/rates.json").read_text())  # which the tests that it names find again
 LEARNT = json.loads((ROOT / "reference/checkpoint/rates.json").read_text())  # of the reference policy, by simulator
 WAYS = json.loads((ROOT / "reference/success.json").read_text())["ways"]  # of serving it, by `benchmarks.success`
-PLUGINS = ("arro",)  # pages among those of the policies, of packages in plugins/
 
 
 def _listed(adapters: dict[str, Adapter]) -> Iterator[tuple[str, Adapter]]:
@@ -84,7 +83,7 @@ def policies(folder: str = "") -> Iterator[str]:
     yield from ("| policy | models | source | verified |", "|---|---|---|---|")
     for name, one in _listed(POLICIES):
         source = f"a checkout, {_code(one.checkouts)}" if one.checkouts else "PyPI"
-        said = verified(name, page_of(name, one))
+        said = verified(name, name if name in RUN_WITH else page_of(name, one))
         yield f"| {_link(name, f'`{name}`', one, folder)} | {one.about} | {one.wants or source} | {said} |"
 
 
@@ -144,8 +143,8 @@ TABLES: dict[str, dict[str, list[str]]] = {
 def with_tables(file: str, text: str) -> str:
     """Return the text of a page with its tables, or that of mkdocs.yml with the pages of the adapters."""
     if file == "mkdocs.yml":
-        for folder, adapters, more in (("policies", POLICIES, PLUGINS), ("benchmarks", ENVS, ())):
-            found = dict.fromkeys([*(page_of(name, one) for name, one in _listed(adapters)), *more])
+        for folder, adapters in (("policies", POLICIES), ("benchmarks", ENVS)):
+            found = dict.fromkeys(page_of(name, one) for name, one in _listed(adapters))
             pages = "".join(f"          - {folder}/{page}.md\n" for page in found if page)
             index = f"          - {folder}/index.md\n"
             text = re.sub(f"{index}(?:          - {folder}/.*\n)*", lambda _, new=index + pages: new, text)
