@@ -7,6 +7,7 @@
 #   make integrations [TEST_PROCESSES=3]                            families, and tests of other systems and of endurance
 #   make families [FAMILIES="lerobot lerobot06 hf rcs libero libero_pro …"]    tests of model families, in .venv-NAME each
 #   make verified [FAMILIES="lerobot hf"]                           what they verify, into the tables of docs/policies
+#   make programs                                                   those that others wrote, into the table of docs/programs.md
 #   make docs                                                       the site of docs/, in build/docs, for a browser
 #   make extras [ONLY="record sim"]                                 resolve extras, into the table of docs/install.md
 #   make locks [ONLY=family-hf]                                     resolve the images' packages, into cluster/docker/locks
@@ -23,7 +24,7 @@ SHELL := /bin/bash
 .SHELLFLAGS := -eu -o pipefail -c
 .DELETE_ON_ERROR:
 .DEFAULT_GOAL := setup
-.PHONY: setup demo reference bench gpu gpu-pack check quick test integrations environments families docs verified extras locks dist sbom fmt lint type clean
+.PHONY: setup demo reference bench gpu gpu-pack check quick test integrations environments families docs verified programs extras locks dist sbom fmt lint type clean
 
 VENV ?= .venv
 TORCH ?= torch==2.13.0
@@ -128,6 +129,20 @@ verified-%: $(VENV)-%/.installed
 verified:
 	@$(MAKE) --no-print-directory $(addprefix verified-,$(filter-out libero libero_pro rcs,$(FAMILIES)))
 	$(BIN)/python tests/support/verified.py
+
+# Each in an environment of its own; Stable-Baselines3 and TorchRL in folders beside the torch of this one. openpi's examples want OPENPI_SRC, and
+# LeRobot 0.6 FAMILIES="lerobot lerobot06".
+PROGRAMS := tests/programs tests/learn tests/integration/test_dialects.py tests/integration/test_gateways.py
+programs: export STABLE_BASELINES3_SRC := $(CURDIR)/build/stable-baselines3
+programs: export TORCHRL_SRC := $(CURDIR)/build/torchrl
+programs: setup $(patsubst %,$(VENV)-%/.installed,$(filter lerobot%,$(FAMILIES)))
+	$(PIP) install --quiet --no-deps --upgrade --target "$$STABLE_BASELINES3_SRC" stable-baselines3==2.9.2
+	$(PIP) install --quiet --no-deps --upgrade --target "$$TORCHRL_SRC" torchrl==0.14.1 tensordict==0.14.3 pyvers==0.2.3
+	status=0; options='-p no:cacheprovider -m program --verified'; \
+	$(BIN)/python -m pytest $$options $(PROGRAMS) || status=1; \
+	for family in $(filter lerobot%,$(FAMILIES)); do \
+	  $(VENV)-$$family/bin/python -m pytest $$options tests/families/lerobot || status=1; done; \
+	$(BIN)/python tests/support/tables.py; exit $$status
 
 # Made once for each state of the family's requirements, of what a server installs and of what `env make` adds: not removed as a mere step.
 .PRECIOUS: $(VENV)-%/.installed

@@ -23,7 +23,9 @@ from needs import (
     skip_what_is_missing,
 )
 from process_resources import own_ray_folder, pytest_pyfunc_call, turn
+from programs import RunPrograms
 from schedule import pytest_terminal_summary, pytest_xdist_make_scheduler, seconds, unit
+from verified import VerifyingTests
 
 from vlagents_ray.envs.graphics import prepare_rendering
 
@@ -55,6 +57,18 @@ _RAY_FOLDER = own_ray_folder()
 _ORDER = ("hosts", "server", "ray", shared.FIXTURE, "vulkan", "sim", "torch")
 _SHARED = _ORDER.index(shared.FIXTURE)
 _shared_files: set[Path] = set()
+
+
+def pytest_addoption(parser: pytest.Parser) -> None:
+    parser.addoption(
+        "--verified", action="store_true", help="note what became of tests marked `verifies` and `program`, in JSON"
+    )
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    if config.getoption("--verified"):
+        config.pluginmanager.register(VerifyingTests())
+        config.pluginmanager.register(RunPrograms())
 
 
 def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool | None:

@@ -99,6 +99,18 @@ def test_the_order_of_the_arms_survives_json_and_is_compared() -> None:
     assert "put the arms' commands into the env's order" in found
 
 
+def test_joints_in_another_order_are_found_by_the_names_that_both_sides_have() -> None:
+    env = Contract(action=ActionSpec(names=("left_pan", "left_lift", "left_grip", "right_pan")))
+    assert Contract.from_json(json.loads(json.dumps(env.to_json()))) == env
+    assert "names" not in Contract().to_json()["action"], "older versions refuse what they do not know"
+    same = Contract(action=ActionSpec(names=("left_pan.pos", "left_lift.pos", "right_pan.pos")))
+    assert differences(same, env) == []
+    assert differences(Contract(action=ActionSpec(names=("joint1", "joint2"))), env) == [], "other names say nothing"
+    found = differences(Contract(action=ActionSpec(names=("left_lift", "left_pan", "right_pan"))), env)
+    assert found[0] == "action.names: number 0 is 'left_lift' of the policy and 'left_pan' of the env; use one order"
+    assert len(found) == 2
+
+
 def test_what_an_act_says_on_demand_survives_json_and_is_left_out_for_those_who_do_not_know_it() -> None:
     policy = Contract(behaviour=("logprob", "value"))
     assert Contract.from_json(json.loads(json.dumps(policy.to_json()))) == policy
@@ -136,6 +148,7 @@ def test_only_what_the_contract_offers_may_be_wanted(want: object, error: type[E
         {"action": {"dims": 1}},
         {"action": {"arms": "left"}},
         {"action": {"arms": [1, 2]}},
+        {"action": {"names": "pan"}},
         {"behaviour": "logprob"},
     ],
 )

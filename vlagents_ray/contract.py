@@ -9,7 +9,7 @@ simulator that renders upside down rotates them.
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, fields
 from itertools import combinations
 from typing import Any, Literal
@@ -59,6 +59,7 @@ class ActionSpec:
     high: float | None = None  # upper bound of every number
     # Names of several arms in the row's order: the command of each, then its gripper.
     arms: tuple[str, ...] | None = None
+    names: tuple[str, ...] | None = None  # of the joints in the row's order, with or without grippers
 
     @property
     def relative(self) -> bool | None:
@@ -89,6 +90,8 @@ class Contract:
         stated = asdict(self)
         if self.behaviour is None:
             del stated["behaviour"]  # only policies for learners state it
+        if self.action.names is None:
+            del stated["action"]["names"]
         plain: dict[str, Any] = json.loads(json.dumps(stated, default=np.generic.item))
         return plain
 
@@ -110,7 +113,8 @@ class Contract:
                 top[name] = {str(k): spec(**closed(spec, v, f"contract.{name}.{k}")) for k, v in top[name].items()}
         if "action" in top:
             action = closed(ActionSpec, top["action"], "contract.action")
-            top["action"] = ActionSpec(**{**action, "arms": _names(action.get("arms"), "contract.action.arms")})
+            lists = {name: _names(action.get(name), f"contract.action.{name}") for name in ("arms", "names")}
+            top["action"] = ActionSpec(**{**action, **lists})
         return cls(**{**top, "behaviour": _names(top.get("behaviour"), "contract.behaviour")})
 
 
@@ -206,10 +210,22 @@ def _action_differences(policy: ActionSpec, env: ActionSpec) -> Iterator[str]:
         gives, takes = getattr(policy, name), getattr(env, name)
         if _differ(gives, takes):
             yield f"action.{name}: the policy gives {gives!r}, the env takes {takes!r}; {cure}"
+    for number, ours, theirs in reordered(policy.names or (), env.names or ()):
+        yield f"action.names: number {number} is {ours!r} of the policy and {theirs!r} of the env; use one order"
     if policy.low is not None and env.low is not None and policy.low < env.low:
         yield f"action.low: the policy goes down to {policy.low}, the env takes {env.low}; scale or clip the actions"
     if policy.high is not None and env.high is not None and policy.high > env.high:
         yield f"action.high: the policy goes up to {policy.high}, the env takes {env.high}; scale or clip the actions"
+
+
+def reordered(ours: Sequence[str], theirs: Sequence[str]) -> list[tuple[int, str, str]]:
+    """Return where two lists have the joints that both name in another order: (number, ours, theirs).
+
+    LeRobot's suffix ".pos" does not count.
+    """
+    mine, others = ([name.removesuffix(".pos") for name in names] for names in (ours, theirs))
+    pairs = zip((one for one in mine if one in others), (one for one in others if one in mine), strict=False)
+    return [(mine.index(one), one, other) for one, other in pairs if one != other]
 
 
 _ACTION_CURES = {

@@ -49,6 +49,9 @@ DEADLINE = "deadline_ms"  # in an observation: the time after which `RemoteAgent
 # answer arrives, DELAY rows of LEFTOVER have been executed; the new chunk begins with them, and continues the rest.
 LEFTOVER = "leftover_actions"  # (H', D) float32: the current plan from this observation's tick on
 DELAY = "delay_ticks"  # int: expected ticks until the answer arrives, at most the rows of LEFTOVER; 0: also unknown
+# In the Act of a policy that was trained to be given rows: how many of LEFTOVER its chunk begins with. If more have
+# been executed when it arrives, it continues from a pose that the robot has left, and is dropped.
+GIVEN = "given_rows"  # int
 EXECUTED = "executed_actions"  # in an observation, (N, D): actions not of the policy, executed since the last request
 # In the Act of a served policy: its weights, {"version": int, "fingerprint": str}. Version 0 is the loaded checkpoint.
 POLICY = "policy"
@@ -125,8 +128,9 @@ class Agent:
     statistics: dict[str, Any] | None = None
     """Optional: ranges of the training's numbers as in LeRobot's `stats.json`, {"action": {"min": …, "max": …}, …}.
 
-    "parts" names the parts of the state in their order. A server's metadata have them among the `weights`, and
-    `vlagents-ray robot` compares them with the robot before its first motion.
+    They are in the robot's units; None stands for a number that is not known. "parts" names the parts of the state in
+    their order. A server's metadata have them among the `weights`, and `vlagents-ray robot` compares them with the
+    robot before its first motion.
     """
 
     check: Callable[[np.ndarray, np.ndarray | None], np.ndarray] | None = None

@@ -10,6 +10,7 @@ from eval_fakes import SimulatedTime
 
 from vlagents_ray import ConfigError, InvalidObservation, Obs, PolicyFailed
 from vlagents_ray.chunking.buffer import CaptureClock, Chunk, ChunkBuffer, DelayEstimate
+from vlagents_ray.interface import GIVEN
 
 
 def chunk(number: int, step: int, values: list[float], *, done: bool = False) -> Chunk:
@@ -52,6 +53,15 @@ def test_an_answer_that_came_too_late_altogether_changes_nothing() -> None:
     plan = advanced(30)
     assert not plan.add(chunk(0, 0, [0, 1, 2]))
     assert plan.next is None
+
+
+def test_an_answer_is_dropped_after_more_steps_than_it_was_given_rows() -> None:
+    for steps, taken in ((2, True), (3, False)):
+        plan = ChunkBuffer()
+        plan.add(chunk(0, 0, [0, 1, 2, 3, 4]))
+        values(plan, steps)
+        assert plan.add(chunk(1, 0, [0, 1, 20, 30, 40])._replace(info={GIVEN: 2})) == taken
+        assert values(plan, 1) == [20 if taken else 3]
 
 
 def test_an_answer_one_step_too_late_is_good_for_its_last_row_if_there_is_no_other() -> None:

@@ -26,7 +26,7 @@ from vlagents_ray import (
 )
 from vlagents_ray.chunking.player import ChunkPlayer, PlayerSettings
 from vlagents_ray.errors import InvalidAction
-from vlagents_ray.interface import DELAY, LEFTOVER
+from vlagents_ray.interface import DELAY, GIVEN, LEFTOVER
 from vlagents_ray.robot import Guard
 from vlagents_ray.testing import check_agent
 
@@ -533,6 +533,32 @@ def test_real_time_chunking_over_the_wire_joins_chunks_without_a_jump(real_time:
     assert len(chunks) > 3
     jumps = np.abs(np.diff(actions) - 0.1)
     assert (jumps.max() < 1e-4) == real_time
+
+
+class Given(Counting):
+    """Trained with prefixes: its chunks begin with at most two rows of the plan, and go on faster each time."""
+
+    def act(self, obs: Obs) -> Act:
+        plain, left = super().act(obs), obs.info.get(LEFTOVER)
+        if left is None:
+            return plain
+        given = min(obs.info[DELAY] or 2, 2)
+        more = left[given - 1] + 0.1 * len(self.seen) * np.arange(1, self.rows - given + 1)[:, np.newaxis]
+        return Act(np.concatenate([left[:given], more]).astype(np.float32), info={GIVEN: given})
+
+
+def test_an_answer_later_than_the_rows_it_was_given_is_dropped_and_the_plan_goes_on(playing: Playing) -> None:
+    agent, player = playing(Given(gated=True, rows=10), mode="async", real_time_chunking=True)
+    actions, chunks = [], []
+    for t, ticks in ((0, 2), (2, 4), (6, 1), (7, 1)):  # each answer comes after so many ticks
+        for tick in range(t, t + ticks):
+            act = player.act(obs(tick))
+            actions.append(round(float(act.action[0]), 4))
+            chunks.append(act.info["chunk"])
+            assert "safe" not in act.info
+        let(agent, player)
+    assert chunks == [0, 0, 1, 1, 1, 1, 1, 3], "the third answer came after four rows, of which it was given one"
+    assert actions == pytest.approx([0, 0.1, 0.2, 0.4, 0.6, 0.8, 1.0, 1.4])
 
 
 def test_a_player_is_driven_again_while_its_last_request_is_under_way(playing: Playing) -> None:

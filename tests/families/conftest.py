@@ -9,7 +9,6 @@ import importlib.util
 from pathlib import Path
 
 import pytest
-from verified import VerifyingTests
 
 from vlagents_ray.registry import ENVS, POLICIES
 
@@ -21,17 +20,6 @@ _NEEDS = {name: one.needs[bool(one.checkouts) :] for name, one in (POLICIES | EN
 
 _FOLDERS = {test.parent.name for test in Path(__file__).parent.glob("*/test_*.py")}
 collect_ignore = [folder for folder in _FOLDERS if not all(map(importlib.util.find_spec, _NEEDS[folder]))]
-
-
-def pytest_addoption(parser: pytest.Parser) -> None:
-    parser.addoption(
-        "--verified", action="store_true", help="note what tests marked `verifies` verified, in verified.json"
-    )
-
-
-def pytest_configure(config: pytest.Config) -> None:
-    if config.getoption("--verified", False):
-        config.pluginmanager.register(VerifyingTests())
 
 
 def pytest_itemcollected(item: pytest.Item) -> None:

@@ -71,7 +71,15 @@ def require_own_answers(said: list[list[Any]], client: str) -> None:
             assert [row[:4] for row in rows] == [[sent["pixel"], number, acts, float(previous.split()[-1])]]
 
 
-@pytest.mark.parametrize("client", ["openpi", "roboarena", "openvla", "vla_eval"])
+NAMES = {
+    "openpi": "openpi-client",
+    "roboarena": "RoboArena's messages",
+    "openvla": "OpenVLA's `requests` and json-numpy",
+    "vla_eval": "vla-eval",
+}
+
+
+@pytest.mark.parametrize("client", [pytest.param(client, marks=pytest.mark.program(NAMES[client])) for client in NAMES])
 def test_the_real_clients_get_their_own_answers(server: Server, python: Path, client: str) -> None:
     said = drive(python, client, url_for(client, server), 8, CALLS)
     assert [len(one) for one in said] == [CALLS] * 8
@@ -83,16 +91,19 @@ def test_openpi_takes_a_whole_url_with_a_path(server: Server, python: Path, path
     require_own_answers(drive(python, "openpi", websocket(server, path), 1, 4), "openpi")
 
 
+@pytest.mark.program(NAMES["openpi"])
 def test_openpis_client_reads_the_key_that_is_missing(server: Server, python: Path) -> None:
     ((said,),) = drive(python, "openpi_error", websocket(server), 1, 1)
     assert "observation/wrist_image" in said
     assert "Traceback" not in said.partition("Error in inference server:")[2]
 
 
+@pytest.mark.program(NAMES["openvla"])
 def test_openvlas_own_words_with_the_json_module_patched(server: Server, python: Path) -> None:
     require_own_answers(drive(python, "openvla_patched", server.url, 1, 1), "openvla")
 
 
+@pytest.mark.program(NAMES["vla_eval"])
 def test_vla_eval_runs_a_benchmark_by_its_own_orchestrator(server: Server, python: Path) -> None:
     ((result,),) = drive(python, "vla_eval_run", websocket(server, "/vla-eval"), 1, 3)
     assert result["server_info"]["model_server"] == "served_agents:Mirror"

@@ -109,6 +109,7 @@ def test_the_metadata_say_where_the_gateways_listen(ports: Ports) -> None:
     )
 
 
+@pytest.mark.program("vlagents")
 def test_vlagents_0_3_raw_jpeg_and_shared_memory_at_once(ports: Ports) -> None:
     """Every client gets its own answers, and one's end leaves the others' memory where it is."""
     with robots(ports.vlagents, "raw", "jpeg", "shm", "shm") as fleet:

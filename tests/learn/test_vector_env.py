@@ -97,6 +97,7 @@ def same(one: Any, other: Any) -> None:
         assert np.asarray(one).dtype == np.asarray(other).dtype
 
 
+@pytest.mark.program("Gymnasium's checkers")
 @pytest.mark.parametrize("mode", [AutoresetMode.SAME_STEP, AutoresetMode.NEXT_STEP])
 def test_it_does_what_gymnasiums_own_vector_env_does(mode: AutoresetMode) -> None:
     ours, numbers = of(Ending, 3, mode), itertools.count(8)
@@ -126,6 +127,7 @@ def test_without_autoreset_those_that_are_over_are_reset_by_their_mask() -> None
         venv.step(np.zeros((3, 1)))
 
 
+@pytest.mark.program("Gymnasium's checkers")
 @pytest.mark.parametrize("observation", ["all", "state"])
 @pytest.mark.filterwarnings("ignore:.*A Box observation space m.*imum value is:UserWarning")  # positions have no bounds
 @pytest.mark.filterwarnings("ignore:.*Not able to test alternative render modes:UserWarning")  # as there are none
@@ -159,6 +161,7 @@ class as_vector_env_of_tabletop:  # noqa: N801 - a context manager
         self._venv.close()
 
 
+@pytest.mark.program("Gymnasium's checkers")
 def test_a_list_of_seeds_is_one_for_each_environment_and_later_episodes_go_on_after_them() -> None:
     with as_vector_env_of_tabletop(3, "all") as venv:
         several, infos = venv.reset(seed=[107, 4, 100])
@@ -284,6 +287,7 @@ SOURCE = "STABLE_BASELINES3_SRC"  # a checkout, or a folder of `pip install --ta
 
 
 @pytest.mark.source(SOURCE)
+@pytest.mark.program("Stable-Baselines3")
 @pytest.mark.torch
 @pytest.mark.slow
 def test_ppo_learns_to_swing_a_pendulum_up() -> None:
@@ -293,3 +297,31 @@ def test_ppo_learns_to_swing_a_pendulum_up() -> None:
     curve = [float(line.split()[1]) for line in printed.splitlines()]
     assert curve[0] < -900, "or the test shows nothing: untrained"
     assert curve[-1] > -400, curve
+
+
+TORCHRL = "TORCHRL_SRC"  # a folder of `pip install --target`
+OF_TORCHRL = """
+import sys
+from torchrl.envs import GymWrapper
+from torchrl.envs.utils import check_env_specs
+from vlagents_ray.learn import as_vector_env
+options = {"width": 32, "height": 32, "max_steps": 6}
+envs = as_vector_env("tabletop/lift", 2, observation=sys.argv[1], autoreset="disabled", env_options=options)
+env = GymWrapper(envs)
+env.set_seed(3)
+check_env_specs(env)
+played = env.rollout(20, break_when_any_done=False)
+print(*played.shape, int(played["next", "done"].sum()))
+"""
+
+
+@pytest.mark.source(TORCHRL)
+@pytest.mark.program("TorchRL")
+@pytest.mark.torch
+@pytest.mark.parametrize("observation", ["state", "all"])
+def test_torchrl_takes_them_for_its_own_and_resets_each_that_is_over(observation: str) -> None:
+    environment = {**os.environ, "PYTHONPATH": f"{ROOT}:{os.environ[TORCHRL]}"}
+    command = [sys.executable, "-c", OF_TORCHRL, observation]
+    done = subprocess.run(command, cwd=ROOT, env=environment, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.splitlines()[-1] == "2 20 6"  # 2 environments, 20 steps, 3 whole episodes of 6 in each

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 from normal_steps import logprob_of_steps
 
+from vlagents_ray.policies import flow
 from vlagents_ray.policies.base import Row
 from vlagents_ray.policies.flow import RandomSteps, chain_entropy, follow, logprob_of_chain, step_mean, step_std
 
@@ -124,3 +126,9 @@ def test_the_entropy_is_the_expected_negative_log_probability() -> None:
 
 def test_only_what_is_wanted_is_stated() -> None:
     assert list(stated(row(0, "entropy"))[0]) == ["entropy"]
+
+
+def test_no_statement_imports_from_the_lazy_module() -> None:
+    """`torch.compile` of torch 2.11 follows no import from `transformers` itself; `require` is for code around it."""
+    package = Path(flow.__file__).parent
+    assert not [file for file in package.rglob("*.py") if "from transformers import" in file.read_text()]

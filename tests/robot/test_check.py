@@ -2,6 +2,7 @@
 
 from collections.abc import Iterator
 from contextlib import closing, contextmanager
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -149,6 +150,18 @@ def test_the_report_has_pictures_and_no_links(tmp_path: Path) -> None:
     page = (tmp_path / "report.html").read_text()
     assert page.count("<img") == len(report.pictures) == 4
     assert "http" not in page
+
+
+def test_joints_in_another_order_than_that_of_the_policy_are_found_by_name_before_any_motion() -> None:
+    with closing(simulated_arm("franka", cameras=())) as arm:
+        names = list(arm.joint_names)
+        names[2], names[3] = names[3], names[2]
+        contract = replace(arm.contract, action=replace(arm.contract.action, names=tuple(names)))
+        report = examine(arm, contract=contract, operator=SimulatedOperator(arm), clock=arm.clock)
+    [finding] = report.findings
+    assert (finding.check, finding.when) == ("order", "before any motion")
+    assert finding.got == "'panda_joint3' as joint 2 of the arm"
+    assert finding.want == "'panda_joint4', as the contract states"
 
 
 def test_limits_of_another_number_of_joints_are_an_error() -> None:

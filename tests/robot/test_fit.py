@@ -11,10 +11,11 @@ import pytest
 
 from vlagents_ray import Act, ActionSpec, Agent, ConfigError, Contract, Obs
 from vlagents_ray.cli.robot import _require_fit, parse
-from vlagents_ray.contract import StateSpec
+from vlagents_ray.contract import StateSpec, require_match
 from vlagents_ray.errors import ContractMismatch
 from vlagents_ray.robot import Limits
 from vlagents_ray.robot.fit import Trained, require_fit
+from vlagents_ray.robot.loop import contract_of
 
 LOW, HIGH = [-1.0, -2.0, 0.0], [1.0, 0.5, 1.0]
 TRAINED = Trained((np.array(LOW), np.array(HIGH)), (np.array(LOW), np.array(HIGH)))
@@ -107,6 +108,15 @@ def test_joints_in_another_order_than_that_of_the_limits_are_found_by_name() -> 
     assert Trained().misfits(None, None, Limits(joints=("joint1", "joint2")), NAMES) == [], "other names say nothing"
 
 
+def test_joints_in_another_order_than_that_of_the_policy_are_found_by_name() -> None:
+    policy = Contract(action=ActionSpec(dim=3, names=("lift.pos", "pan.pos", "gripper.pos")))
+    with pytest.raises(ContractMismatch, match="number 0 is 'lift' of the policy and 'pan' of the env") as caught:
+        require_match(policy, contract_of(Standing(0, 0)))
+    assert str(caught.value).count("\n- ") == 2
+    require_match(Contract(action=ActionSpec(names=NAMES)), contract_of(Standing(0, 0)))
+    require_match(policy, contract_of(Nameless()))
+
+
 class Still(Agent):
     contract: Contract | None = Contract(  # type: ignore[assignment]
         state={"joints": StateSpec(2)}, gripper=True, action=ActionSpec(dim=3)
@@ -122,7 +132,7 @@ class Still(Agent):
 class Standing:
     """A robot at rest."""
 
-    joint_names = NAMES[:2]
+    joint_names: tuple[str, ...] = NAMES[:2]
 
     def __init__(self, *joints: float) -> None:
         self.joints = np.array(joints, np.float32)
@@ -134,6 +144,15 @@ class Standing:
         raise AssertionError
 
     def stop(self) -> None: ...
+
+
+class Nameless(Standing):
+    """A robot that names no joints."""
+
+    joint_names = ()
+
+    def __init__(self) -> None:
+        super().__init__(0, 0)
 
 
 RANGES = {"min": LOW, "max": HIGH}

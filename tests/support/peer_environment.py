@@ -1,7 +1,7 @@
 """Python environments with other systems' clients from PyPI, some of whose requirements conflict with ours.
 
-They are `.venv-peers` and `.venv-peers-torch` of this checkout, those that the benchmark uses; each is created at first
-use.
+They are `.venv-peers` and `.venv-peers-torch` of this checkout, those that the benchmark uses, and `.venv-peers-NAME`
+of single programs; each is created at first use.
 """
 
 from __future__ import annotations
@@ -9,11 +9,12 @@ from __future__ import annotations
 import json
 import os
 import subprocess
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
 from benchmarks.peers import REQUIREMENTS, TORCH, TORCH_REQUIREMENTS, set_up
-from vlagents_ray.serve.python_env.create import install, python_in
+from vlagents_ray.serve.python_env.create import create, find_python, install, python_in
 
 FOLDER = Path(os.environ.get("VLAGENTS_PEERS", Path(__file__).parents[2] / ".venv-peers"))
 CLIENTS = Path(__file__).with_name("peer_clients.py")
@@ -21,19 +22,31 @@ CLIENTS = Path(__file__).with_name("peer_clients.py")
 
 def peers_python(environment: str = "") -> Path:
     """The Python of the first environment, or of the second if it is `TORCH`, with the pinned packages in it."""
-    folder = FOLDER.with_name(FOLDER.name + environment)
     requirements = TORCH_REQUIREMENTS if environment == TORCH else REQUIREMENTS
+    return _made(environment, requirements.read_text(), lambda folder: set_up(folder, requirements))
+
+
+def environment(name: str, wanted: Sequence[str], python: str) -> Path:
+    """The Python of an environment of one program, with `wanted`, arguments of `uv pip install`."""
+
+    def make(folder: Path) -> None:
+        install(create(folder, find_python(python)), wanted)
+
+    return _made(f"-{name}", "\n".join(wanted), make)
+
+
+def _made(end: str, wanted: str, make: Callable[[Path], object]) -> Path:
+    folder = FOLDER.with_name(FOLDER.name + end)
     stamp = folder / "installed.txt"
-    wanted = requirements.read_text()
     if not stamp.is_file() or stamp.read_text() != wanted:
-        set_up(folder, requirements)
+        make(folder)
         stamp.write_text(wanted)
     return python_in(folder)
 
 
-def drive(python: Path, client: str, *words: object, timeout_s: float = 120) -> Any:
-    """What a client of `peer_clients.py` has to say at its end; its error is this process's."""
-    command = [str(python), str(CLIENTS), client, *map(str, words)]
+def drive(python: Path, client: str, *words: object, script: Path = CLIENTS, timeout_s: float = 120) -> Any:
+    """What a client of `peer_clients.py`, or of another script, has to say at its end; its error is this process's."""
+    command = [str(python), str(script), client, *map(str, words)]
     done = subprocess.run(command, check=False, capture_output=True, text=True, timeout=timeout_s)
     assert done.returncode == 0, f"{client} ended with {done.returncode}:\n{done.stdout[-2000:]}\n{done.stderr[-4000:]}"
     return json.loads(done.stdout.splitlines()[-1])

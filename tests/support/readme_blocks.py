@@ -1,9 +1,9 @@
 """Reading, running and checking the fenced blocks of a Markdown text, its commands, and the files of examples/.
 
 An HTML comment straight above a block says how it is tested. `<!-- test: serve scripted -->` runs it
-with a server of that policy in place of http://gpu-box:8000 or http://localhost:8000, `<!-- test -->` or no comment without
-one; ` with peers` at the end of either runs it with the Python that has other systems' clients, and
-` with ray` says of a block of docs/ that it starts Ray.
+with a server of that policy in place of http://gpu-box:8000 or http://localhost:8000, `<!-- test -->` or no
+comment without one; ` with peers` at the end of either runs it with the Python that has other systems'
+clients, and ` with ray` says of a block of docs/ that it starts Ray.
 Further lines of such a comment are code that is run before the block:
 
     <!-- test: serve scripted

@@ -11,6 +11,7 @@ import re
 from collections.abc import Iterable, Iterator
 from pathlib import Path
 
+from programs import others, ran, settings
 from verified import RUN_WITH, marked, notes
 
 from vlagents_ray.evaluate.results.statistics import wilson
@@ -136,6 +137,7 @@ TABLES: dict[str, dict[str, list[str]]] = {
     },
     "docs/policies/index.md": {"policies": list(policies())},
     "docs/policies/reference.md": {"rates": list(rates()), "success": list(ways())},
+    "docs/programs.md": {"programs": list(ran()), "settings": list(settings()), "others": list(others())},
     "docs/benchmarks/index.md": {"environments": list(environments())},
 }
 

@@ -181,7 +181,7 @@ def _once(reasons: Iterable[str]) -> str:
     return "; ".join(dict.fromkeys(reasons))
 
 
-def _version(name: str) -> str:
+def installed_version(name: str) -> str:
     """Return the version of a package, or the commit of the checkout that a variable names."""
     if name.isupper():
         folder = os.environ.get(name)
@@ -195,7 +195,7 @@ def _version(name: str) -> str:
 
 
 def _environment(family: str) -> dict[str, Any]:
-    versions = {name: _version(name) for name in RUN_WITH[family][1]}
+    versions = {name: installed_version(name) for name in RUN_WITH[family][1]}
     torch = sys.modules.get("torch")
     device = torch.cuda.get_device_name() if torch is not None and torch.cuda.is_available() else "a CPU, not on a GPU"
     return {"python": _python(), "versions": versions, "device": device}

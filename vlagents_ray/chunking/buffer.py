@@ -18,7 +18,7 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 
 from vlagents_ray.errors import ConfigError, InvalidObservation, PolicyFailed
-from vlagents_ray.interface import AGE, AGE_MS, CAPTURED, CHUNK, DELAY, LEFTOVER, PLANNED, ROW, SILENT, Act, Obs
+from vlagents_ray.interface import AGE, AGE_MS, CAPTURED, CHUNK, DELAY, GIVEN, LEFTOVER, PLANNED, ROW, SILENT, Act, Obs
 
 Mode = Literal["open_loop", "ensemble", "async"]
 Merge = Callable[[np.ndarray, np.ndarray], np.ndarray]
@@ -105,13 +105,15 @@ class ChunkBuffer:
         self._chunks: deque[Chunk] = deque()
 
     def add(self, chunk: Chunk) -> bool:
-        """Add a chunk; return False if it has no row left to execute.
+        """Add a chunk; return False if it has no row left to execute, or came too late (`outruns`).
 
         If no other row is left, the last row may be executed one step late: an answer with a single action has no
         other row, and arrives after the previous action has been executed.
         """
         while self._chunks and self._chunks[0].end <= self.executed:
             self._chunks.popleft()
+        if self.outruns(chunk.step, chunk.info):
+            return False
         if chunk.end == self.executed and self.next is None:
             chunk = chunk._replace(step=chunk.step + 1)
         if chunk.end <= self.executed:
@@ -157,6 +159,10 @@ class ChunkBuffer:
         """Return the `Obs.info` of a request with real-time chunking, whose answer is expected in `delay` ticks."""
         rest = self.leftover()
         return {} if rest is None else {LEFTOVER: rest, DELAY: min(delay, len(rest))}
+
+    def outruns(self, step: int, info: Mapping[str, Any]) -> bool:
+        """Return whether more rows were executed since `step`, that of an answer, than it was `GIVEN` in its `info`."""
+        return bool(self.executed - step > info.get(GIVEN, math.inf))
 
     def drop(self, before: float = math.inf) -> bool:
         """Drop chunks with observations from before a time, s of `time.monotonic`; return whether there were any."""

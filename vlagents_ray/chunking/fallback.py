@@ -24,7 +24,7 @@ from vlagents_ray.validation import check_action
 SafeName = Literal["auto", "hold", "zero"]
 Cause = Literal[
     "waiting",  # the last answer has no rows left, and the next one is pending: not counted as `safe`
-    "late",  # the answer arrived too late for all its rows
+    "late",  # the answer arrived too late for all its rows, or for those that it was given
     "old",  # the plan is older than max_age_s
     "stale",  # the observation is older than max_age_s
     "lost",  # the server did not answer: no connection, or not in time
@@ -49,7 +49,7 @@ class Held(NamedTuple):
 
 
 WAITING = Held("waiting", "waiting for an answer: all rows of the last one have been executed")
-LATE = Held("late", "the answer came so late that others had been executed in place of all its rows")
+LATE = Held("late", "the answer came so late that the robot had passed its rows; lower the latency, or the rate (hz)")
 OLD = Held("old", "what was planned is older than max_age_s")
 STALE = Held(
     "stale",

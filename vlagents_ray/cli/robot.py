@@ -28,7 +28,7 @@ from vlagents_ray.errors import ConfigError, VLAgentsError
 from vlagents_ray.interface import Agent
 from vlagents_ray.robot.fit import Trained, require_fit
 from vlagents_ray.robot.limits import Limits
-from vlagents_ray.robot.loop import LoopReport, Restart, Robot, import_class, robot_named, run_loop
+from vlagents_ray.robot.loop import LoopReport, Restart, Robot, contract_of, import_class, robot_named, run_loop
 from vlagents_ray.robot.record import Recorder
 from vlagents_ray.robot.ros import RosRobot, read_settings
 from vlagents_ray.robot.safety import SOFT_START_S, Guard, Watchdog, measured_state
@@ -108,8 +108,7 @@ def _run(options: argparse.Namespace) -> LoopReport:
     say: Callable[[str], None] = lambda line: print(line, flush=True)  # noqa: E731, T201
     hz = options.hz or _HZ
     deadline_s = 0.0 if options.mode == "async" else WAIT_S
-    if options.deadline_ms is not None:
-        deadline_s = options.deadline_ms / 1e3
+    deadline_s = deadline_s if options.deadline_ms is None else options.deadline_ms / 1e3
     make_robot = robot_named("--robot", options.robot, options.robot_set) if options.robot else None
     make_leader = import_class("--leader", options.leader) if ":" in (options.leader or "") else None
     with contextlib.ExitStack() as stack:
@@ -124,34 +123,19 @@ def _run(options: argparse.Namespace) -> LoopReport:
         stated = contract is not None and contract.action.relative is not None
         if options.safe == "auto" and not options.robot and topics is None and not stated:
             options.safe = "hold"  # the simulated robot uses such actions as absolute targets
-        settings = PlayerSettings(
-            mode=options.mode,
-            execute=options.execute,
-            merge=options.merge,
-            real_time_chunking=options.rtc,
-            deadline_s=deadline_s,
-            horizon=options.horizon,
-            max_age_s=options.max_age_s,
-            safe=options.safe,
-        )
-        guard = Guard(
-            contract,
-            max_step=options.max_step,
-            measure=measured_state(options.measure),
-            limits=options.limits,
-            hz=hz,
-            soft_start_s=options.soft_start_s,
-        )
+        given = named(options, "mode", "execute", "merge", "horizon", "max_age_s", "safe")
+        settings = PlayerSettings(real_time_chunking=options.rtc, deadline_s=deadline_s, **given)
+        motion = named(options, "max_step", "limits", "soft_start_s")
+        guard = Guard(contract, measure=measured_state(options.measure), hz=hz, **motion)
         player = stack.enter_context(ChunkPlayer(agent, settings, check=guard, override=leader))
         player.initialize()  # refuses unfit settings before anything is timed or moves
         robot: Robot = topics or (SimulatedRobot(contract) if make_robot is None else make_robot())
         stack.callback(getattr(robot, "close", lambda: None))
         if topics is not None or make_robot is not None or options.trained_on is not None:
-            require_match(contract, getattr(robot, "contract", None))
+            require_match(contract, contract_of(robot))
             _require_fit(options, agent, robot, guard.limits, say)
-        recorder = None
-        if options.record:
-            recorder = stack.enter_context(Recorder(options.record, hz, interventions=leader is not None))
+        opened = Recorder(options.record, hz, interventions=leader is not None) if options.record else None
+        recorder = None if opened is None else stack.enter_context(opened)
         viewer = None if options.rerun is None else stack.enter_context(open_viewer(options.rerun))
         hangs_s = max(0.2, 5 / hz) + deadline_s
 
@@ -164,18 +148,9 @@ def _run(options: argparse.Namespace) -> LoopReport:
         if topics is not None:
             topics.watchdog = watchdog
         stack.enter_context(_restarting(watchdog, say))
+        given = named(options, "instruction", "seconds", "restart", "real_time")
         report = run_loop(
-            robot,
-            player,
-            hz=hz,
-            instruction=options.instruction,
-            seconds=options.seconds,
-            watchdog=watchdog,
-            restart=options.restart,
-            recorder=recorder,
-            viewer=viewer,
-            real_time=options.real_time,
-            commands=commands,
+            robot, player, hz=hz, watchdog=watchdog, recorder=recorder, viewer=viewer, commands=commands, **given
         )
         if report.outcome:
             say(f"marked as a {report.outcome} on the live page")
@@ -190,6 +165,11 @@ def _run(options: argparse.Namespace) -> LoopReport:
     if viewer is not None:
         say(viewer.report())
     return report
+
+
+def named(options: argparse.Namespace, *names: str) -> dict[str, Any]:
+    """Return the options that are arguments of the same names elsewhere."""
+    return {name: getattr(options, name) for name in names}
 
 
 def _require_fit(
@@ -280,14 +260,11 @@ def _number(kind: type[float] | type[int] = float, *, least: float = 0, above: b
     """Return a function with which argparse reads a number not below `least`, or above it."""
 
     def read(text: str) -> float:
-        try:
-            value = kind(text)
-        except ValueError:
-            value = kind(least) - 1
-        if not (value > least if above else value >= least):
-            what = "a whole number" if kind is int else "a number"
-            raise argparse.ArgumentTypeError(f"got {text!r}, want {what} {'above' if above else 'from'} {least:g}")
-        return value
+        with contextlib.suppress(ValueError):
+            if (value := kind(text)) > least or (value == least and not above):
+                return value
+        what = "a whole number" if kind is int else "a number"
+        raise argparse.ArgumentTypeError(f"got {text!r}, want {what} {'above' if above else 'from'} {least:g}")
 
     return read
 

@@ -53,14 +53,9 @@ def _checked(options: argparse.Namespace, stack: contextlib.ExitStack) -> RobotR
     if options.policy is not None:
         with RemoteAgent(options.policy) as agent:
             contract = agent.contract
-    return examine(
-        robot,
-        contract=contract,
-        operator=getattr(robot, "operator", None) or Operator(move=options.move),
-        hz=options.hz,
-        latency_s=options.latency_ms / 1e3,
-        clock=getattr(robot, "clock", time),
-    )
+    operator, clock = getattr(robot, "operator", None) or Operator(move=options.move), getattr(robot, "clock", time)
+    latency_s = options.latency_ms / 1e3
+    return examine(robot, contract=contract, operator=operator, hz=options.hz, latency_s=latency_s, clock=clock)
 
 
 def command_parser() -> argparse.ArgumentParser:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import argparse
 import contextlib
 from collections.abc import Iterable
-from typing import Any
 
 import typer
 
@@ -17,7 +16,7 @@ from vlagents_ray.client.agent import RemoteAgent
 from vlagents_ray.contract import Contract, require_match
 from vlagents_ray.envs.base import EvalEnv, make_env
 from vlagents_ray.errors import ConfigError
-from vlagents_ray.interface import Agent, Obs
+from vlagents_ray.interface import Agent
 from vlagents_ray.policies.wrapper import Wrapper, build_agent
 from vlagents_ray.robot import Guard, run_loop
 from vlagents_ray.robot.episode import Label
@@ -55,12 +54,6 @@ class EnvPolicy(Wrapper):
         """The policy's contract, or the environment's if that states no actions."""
         own = self.agent.contract
         return self._env if own is None or own.action.relative is None else own
-
-    def begin(self, obs: Obs, instruction: str | None) -> Obs:
-        return obs
-
-    def change_batch(self, obs: Any, sessions: Any) -> list[Obs | Exception]:
-        return list(obs)
 
 
 def drive(options: argparse.Namespace) -> int:
@@ -103,13 +96,8 @@ class RobotRun:
             env = stack.enter_context(make_env(self.options.env, **self._env_options))
             hz = self.options.hz or env.contract.control_hz or _HZ
             leader = self._leader(env.contract, stack)
-            guard = Guard(
-                env.contract,
-                max_step=self.options.max_step,
-                limits=self.options.limits,
-                hz=hz,
-                soft_start_s=self.options.soft_start_s,
-            )
+            motion = {name: getattr(self.options, name) for name in ("max_step", "limits", "soft_start_s")}
+            guard = Guard(env.contract, hz=hz, **motion)
             agent = stack.enter_context(self._agent(env.contract, leader, guard))
             self._control = agent.control
             if self.options.record is not None:

@@ -10,6 +10,7 @@ few per cent on camera images with noise. Files of this form are read in the sam
 
 from __future__ import annotations
 
+import base64
 import io
 import struct
 import warnings
@@ -148,6 +149,11 @@ def _chunk_name(view: memoryview, at: int) -> bytes:
 def _chunk(kind: bytes, data: bytes) -> bytes:
     checksum = zlib.crc32(data, zlib.crc32(kind))
     return struct.pack(">I", len(data)) + kind + data + struct.pack(">I", checksum)
+
+
+def data_url(kind: str, data: bytes) -> str:
+    """Return a URL with `data` of the media type `kind`."""
+    return f"data:{kind};base64,{base64.b64encode(data).decode()}"
 
 
 def _check(image: np.ndarray) -> None:

@@ -146,7 +146,7 @@ class BatchVectorEnv(vector.VectorEnv):  # type: ignore[misc]
             ConfigError: The environments' contract does not state a size.
         """
         self._batch, self._observation, self._reset_options = batch, observation, dict(reset_options or {})
-        self._autoreset = autoreset
+        self.autoreset_mode = autoreset
         self._contract = batch.contract
         self.num_envs = batch.num_envs
         self.metadata = {"render_modes": [], "autoreset_mode": autoreset}
@@ -202,7 +202,7 @@ class BatchVectorEnv(vector.VectorEnv):  # type: ignore[misc]
         """
         if not self._seen:
             raise NotReset("step before reset; call reset(seed=...) first")
-        if self._over.any() and self._autoreset == vector.AutoresetMode.DISABLED:
+        if self._over.any() and self.autoreset_mode == vector.AutoresetMode.DISABLED:
             raise NotReset(
                 f"environments {np.flatnonzero(self._over).tolist()} are over, and autoreset is disabled; call "
                 f"reset(options={{'reset_mask': ...}})"
@@ -222,10 +222,10 @@ class BatchVectorEnv(vector.VectorEnv):  # type: ignore[misc]
             self._over[i] = terminated[i] or truncated[i]
             if self._batch.several_tasks:
                 info["instruction"] = self._batch.instructions[i]
-            last = self._over[i] and self._autoreset == vector.AutoresetMode.SAME_STEP
+            last = self._over[i] and self.autoreset_mode == vector.AutoresetMode.SAME_STEP
             said = {"final_obs": observed(step.obs, self._observation), "final_info": info} if last else info
             self._add_info(infos, said, i)
-        if self._over.any() and self._autoreset == vector.AutoresetMode.SAME_STEP:
+        if self._over.any() and self.autoreset_mode == vector.AutoresetMode.SAME_STEP:
             self._begin(self._over.copy(), infos)
         return self._observations(), rewards, terminated, truncated, infos
 

@@ -94,9 +94,6 @@ class AbsoluteActions(Wrapper):
                 f"state, such as joints; leave the wrapper out"
             )
 
-    def begin(self, obs: Obs, instruction: str | None) -> Obs:
-        return obs
-
     def change_batch(self, obs: Sequence[Obs], sessions: Sequence[Wrapper]) -> list[Obs | Exception]:
         return [attempt(self._with_relative_plan, one) for one in obs]
 

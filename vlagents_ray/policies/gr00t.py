@@ -47,6 +47,7 @@ class Embodiment:
     moments: Mapping[str, tuple[int, ...]]  # of "video" and "state": offsets of the observations read, 0 for the newest
     horizon: int  # rows of a chunk
     spec: ActionSpec
+    ranges: Mapping[str, Any]  # of the training: "state" and "action", by group, in the robot's units
 
     @property
     def history(self) -> int:
@@ -80,10 +81,11 @@ class Embodiment:
             )
         config, numbers = configs[chosen], statistics[chosen]
         names = ("q01", "q99") if settings.get("use_percentiles") else ("min", "max")
-        widths = {
-            kind: {group: _width(folder, numbers, kind, group, names) for group in config[kind]["modality_keys"]}
+        ranges = {
+            kind: {group: _range(folder, numbers, kind, group, names) for group in config[kind]["modality_keys"]}
             for kind in ("state", "action")
         }
+        widths = {kind: {group: len(one[names[0]]) for group, one in groups.items()} for kind, groups in ranges.items()}
         return cls(
             chosen,
             tuple(config["video"]["modality_keys"]),
@@ -96,6 +98,7 @@ class Embodiment:
                 sum(widths["action"].values()),
                 converted=bool(settings.get("use_relative_action")),
             ),
+            ranges,
         )
 
     def require_fits(self, config: Any) -> None:
@@ -112,8 +115,8 @@ class Embodiment:
                 )
 
 
-def _width(folder: Path, numbers: Mapping[str, Any], kind: str, group: str, names: tuple[str, str]) -> int:
-    """Return the width of a group of the state or of actions, whose bounds are finite."""
+def _range(folder: Path, numbers: Mapping[str, Any], kind: str, group: str, names: tuple[str, str]) -> dict[str, Any]:
+    """Return the bounds of a group of the state or of actions, which are finite."""
     bounds = [np.asarray(numbers.get(kind, {}).get(group, {}).get(name, ()), np.float64) for name in names]
     if bounds[0].ndim != 1 or not bounds[0].size or bounds[0].shape != bounds[1].shape:
         raise ConfigError(
@@ -122,7 +125,7 @@ def _width(folder: Path, numbers: Mapping[str, Any], kind: str, group: str, name
         )
     if not np.isfinite(bounds).all():
         raise ConfigError(f"checkpoint {folder}: {list(names)} of {kind} {group!r} are not all finite; {_CURE}")
-    return int(bounds[0].size)
+    return dict(zip(names, (bound.tolist() for bound in bounds), strict=True))
 
 
 def _action(groups: Any, dim: int, *, converted: bool) -> ActionSpec:
@@ -132,15 +135,9 @@ def _action(groups: Any, dim: int, *, converted: bool) -> ActionSpec:
     GR00T converts relative groups to absolute ones if the processor has `use_relative_action`.
     """
     stated = [group for group in groups if converted and group["rep"] in _CONVERTED]
-    deltas = {_CONVERTED[group["rep"]] for group in stated}
-    spaces = {_SPACES.get(group["type"]) for group in stated}
-    rotations = {_ROTATIONS.get(group["format"]) for group in stated}
-    return ActionSpec(
-        dim=dim,
-        delta=deltas.pop() if len(deltas) == 1 else None,
-        space=spaces.pop() if len(spaces) == 1 else None,
-        rotation=rotations.pop() if len(rotations) == 1 else None,  # type: ignore[arg-type]
-    )
+    tables: Any = {"delta": (_CONVERTED, "rep"), "space": (_SPACES, "type"), "rotation": (_ROTATIONS, "format")}
+    found = {name: {table.get(group[key]) for group in stated} for name, (table, key) in tables.items()}
+    return ActionSpec(dim=dim, **{name: one.pop() for name, one in found.items() if len(one) == 1})
 
 
 class Gr00tConfig(ModelConfig):
@@ -471,6 +468,7 @@ class Gr00t(ModelPolicy):
         """Read the checkpoint; raises `ConfigError` for settings that do not fit it."""
         network = Gr00tNetwork.load(self.config)
         self._cameras(network.embodiment)
+        self.statistics = {"parts": list(self._parts(network.embodiment)), **network.embodiment.ranges}
         compile_with(network.model.action_head.model, self.config.spare_tokens, self.compilation)
         return network
 

@@ -81,6 +81,7 @@ ROBOTS: Mapping[str, RobotConvention] = {  # by the class of openpi's observatio
     ),
     "AlohaInputs": _ALOHA,
 }
+_ENDS = ("q01", "q99")  # the statistics by which a robot is compared with the training
 _ALOHA_SIM = {"images.cam_high": "front"}  # the simulation has one camera
 
 
@@ -117,6 +118,7 @@ class Transforms:
     inputs: Any  # a dict of unbatched arrays -> such a dict
     outputs: Any
     forward: Any  # the part of `inputs` for actions, before the model's own transforms
+    bounds: Sequence[Mapping[str, np.ndarray]]  # of the training's states and actions, in the units of `forward`
     robot: str  # the class of its first observation transform, e.g. "LiberoInputs"
     prompt: bool  # whether a prompt is needed; if not, the config has one
 
@@ -133,10 +135,13 @@ class Transforms:
         except ValueError as error:
             raise ConfigError(f"checkpoint {folder}: {error}; compute its statistics with openpi's script") from error
         robot, model = data.data_transforms, data.model_transforms
+        known = all(getattr(one, end) is not None for one in statistics.values() for end in _ENDS)
+        ends = [{name: getattr(one, end) for name, one in statistics.items()} for end in _ENDS if known]
         return cls(
             openpi.compose([*robot.inputs, normalise, *model.inputs]),
             openpi.compose([*model.outputs, restore, *robot.outputs]),
             openpi.compose([*robot.inputs, normalise]),
+            [normalise(one) for one in ends],
             type(robot.inputs[0]).__name__ if robot.inputs else "",
             not any(
                 getattr(one, "prompt", None) for one in model.inputs if isinstance(one, openpi.InjectDefaultPrompt)
@@ -160,6 +165,33 @@ class Transforms:
         """Convert a robot's actions (H, D) to the model's units, relative to the observation if the model's are."""
         data = _with(observation, instruction) | {"actions": np.array(actions)}
         return np.asarray(self.forward(data)["actions"], np.float32)
+
+    def ranges(self, robot: RobotConvention) -> dict[str, Any] | None:
+        """Return `Agent.statistics` in the robot's units, with None for numbers that `forward` does not only scale.
+
+        openpi's statistics are of transformed numbers: some of ALOHA's joints have another sign, most actions are
+        relative to the state. Random numbers show which ones are the robot's own, by a factor and an offset.
+        """
+        widths, rng = [sum(parts.values()) for parts in robot.state.values()], np.random.default_rng(0)
+        image, seen = np.zeros((224, 224, 3) if robot.layout == "hwc" else (3, 224, 224), np.uint8), []
+        dims = {"state": sum(widths), "actions": robot.action.dim}
+        if not self.bounds or dims["actions"] is None:
+            return None
+        given = [{name: scale * rng.uniform(0.2, 0.8, dim) for name, dim in dims.items()} for scale in (0, 1, 1)]
+        for one in given:
+            data: dict[str, Any] = {"actions": np.array(one["actions"], ndmin=2)}  # a copy, which transforms change
+            state = dict(zip(robot.state, np.split(one["state"], np.cumsum(widths)[:-1]), strict=True))
+            for key, value in (dict.fromkeys(robot.cameras, image) | state).items():
+                _put(data, key, value)
+            seen.append(self.forward(data))
+        found: dict[str, Any] = {"parts": [part for parts in robot.state.values() for part in parts]}
+        for (name, dim), key in zip(dims.items(), ("observation.state", "action"), strict=True):
+            zero, first, second = (np.ravel(one[name])[:dim] for one in seen)
+            factor = (first - zero) / given[1][name]
+            factor[~np.isclose(second, zero + factor * given[2][name], atol=1e-4) | (factor == 0)] = np.nan
+            ends = np.sort([(bound[name][:dim] - zero) / factor for bound in self.bounds], axis=0).tolist()
+            found[key] = {_ENDS[i]: [None if np.isnan(x) else x for x in row] for i, row in enumerate(ends)}
+        return found
 
 
 def _with(observation: dict[str, Any], instruction: str) -> dict[str, Any]:
@@ -515,6 +547,8 @@ class OpenPi(ModelPolicy):
         transforms = Transforms.of(config, folder)
         ours = self.config
         robot = choose_robot(config.name, transforms.robot, ours.cameras, ours.state, ours.layout)
+        found = attempt(transforms.ranges, robot)  # a transform of the user's own may want more of an observation
+        self.statistics = None if isinstance(found, Exception) else found
         if (folder / "model.safetensors").is_file():
             model = load_torch(config, folder, self.config, self.compilation)
         elif (folder / "params").is_dir():

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import abc
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -14,7 +13,7 @@ from vlagents_ray.registry import policy_class, wrapper_class
 from vlagents_ray.settings import wrong_settings
 
 
-class Wrapper(Agent, abc.ABC):
+class Wrapper(Agent):
     """An agent that passes changed observations to an inner agent.
 
     `Config` and `shared` are those of any agent. A session has its own copy of the wrapper and of the inner agent.
@@ -36,17 +35,17 @@ class Wrapper(Agent, abc.ABC):
             message = wrong_settings(error, cls.Config) if isinstance(error, ValueError) else error
             raise ConfigError(f"wrapper {cls.__name__}: {message}") from error
 
-    @abc.abstractmethod
     def begin(self, obs: Obs, instruction: str | None) -> Obs:
         """Begin an episode with its first observation; returns the observation for the inner agent."""
+        return obs
 
-    @abc.abstractmethod
     def change_batch(self, obs: Sequence[Obs], sessions: Sequence[Wrapper]) -> list[Obs | Exception]:
         """Change an observation of each session, given the sessions' copies of the wrapper.
 
         Returns:
             The observations for the inner agent; an exception in the place of one fails that session's request alone.
         """
+        return list(obs)
 
     @property
     def contract(self) -> Contract | None:

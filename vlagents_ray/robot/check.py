@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import base64
 import html
 import time
 from concurrent.futures import ThreadPoolExecutor
@@ -12,11 +11,11 @@ from typing import Any
 
 import numpy as np
 
-from vlagents_ray.contract import ActionSpec, Contract, StateSpec
+from vlagents_ray.contract import ActionSpec, Contract, StateSpec, reordered
 from vlagents_ray.errors import ConfigError, InvalidObservation
-from vlagents_ray.images.jpeg_png import encode_jpeg
+from vlagents_ray.images.jpeg_png import data_url, encode_jpeg
 from vlagents_ray.interface import CAPTURED, Obs
-from vlagents_ray.robot.loop import Robot
+from vlagents_ray.robot.loop import Robot, contract_of
 from vlagents_ray.validation import check_observation
 
 CHECKS = {  # in the order in which they run
@@ -130,15 +129,13 @@ class RobotReport:
 
     def write(self, file: str | Path) -> None:
         """Write the report with its pictures as one HTML page, which needs no network."""
-        lines = "".join(f"<li>{html.escape(line)}</li>" for line in self.lines())
-        pictures = "".join(
-            f'<figure><img src="data:image/jpeg;base64,{base64.b64encode(encode_jpeg(picture)).decode()}">'
-            f"<figcaption>{html.escape(title)}</figcaption></figure>"
-            for title, picture in self.pictures.items()
-        )
         style = "body{font-family:sans-serif}figure{display:inline-block;margin:8px}img{height:240px}"
         page = f"<!doctype html><meta charset=utf-8><title>Check of a robot</title><style>{style}</style>"
-        Path(file).write_text(f"{page}<h1>Check of a robot</h1><ul>{lines}</ul>{pictures}", encoding="utf-8")
+        page += f"<h1>Check of a robot</h1><ul>{''.join(f'<li>{html.escape(line)}</li>' for line in self.lines())}</ul>"
+        for title, picture in self.pictures.items():
+            url = data_url("image/jpeg", encode_jpeg(picture))
+            page += f'<figure><img src="{url}"><figcaption>{html.escape(title)}</figcaption></figure>'
+        Path(file).write_text(page, encoding="utf-8")
 
 
 def examine(
@@ -166,7 +163,7 @@ def examine(
     Returns:
         The findings, and which checks passed or were not made.
     """
-    contract = contract or getattr(robot, "contract", None) or Contract()
+    contract = contract or contract_of(robot)
     suite = _Suite(robot, contract, operator, 1 / (hz or contract.control_hz or 50.0), latency_s, clock)
     try:
         suite.at_rest()
@@ -177,8 +174,7 @@ def examine(
         suite.find("observation", str(error), "an observation that fits the contract", "correct observe", ends=False)
     finally:
         robot.stop()
-    found = {finding.check for finding in suite.report.findings}
-    suite.skip_others("an earlier check found something" if found else "nothing moved")
+    suite.skip_others("an earlier check found something" if suite.report.findings else "nothing moved")
     return suite.report
 
 
@@ -218,6 +214,10 @@ class _Suite:
         self._layout = _Layout.find(self._robot, self._contract, first)
         check_observation(first, self._contract)
         self._passes("observation")
+        names = getattr(self._robot, "joint_names", ())
+        for number, ours, theirs in reordered(names, self._contract.action.names or ())[:1]:
+            cure = "give actions and state the contract's order of joints"
+            self.find("order", f"{ours!r} as joint {number} of the arm", f"{theirs!r}, as the contract states", cure)
         for _ in range(20):
             self._clock.sleep(self._period_s)
             last = self._observe()
@@ -265,13 +265,10 @@ class _Suite:
                 self.report.skipped.setdefault(name, reason)
 
     def _agreed(self, motion: str) -> bool:
-        self._when = ""
-        if self._operator is None:
-            self.skip_others("no operator agreed to a motion")
-        elif self._operator.agrees(motion):
-            self._when = motion
-        else:
-            self.skip_others(f"the operator did not agree to {motion}")
+        self._when = motion if self._operator is not None and self._operator.agrees(motion) else ""
+        if not self._when:
+            refused = f"the operator did not agree to {motion}"
+            self.skip_others("no operator agreed to a motion" if self._operator is None else refused)
         return bool(self._when)
 
     def _passes(self, *checks: str) -> None:
@@ -397,7 +394,7 @@ class _Suite:
 
     def _hold_command(self, layout: _Layout, obs: Obs) -> np.ndarray:
         """Return the action that should move nothing."""
-        action = np.zeros(layout.dim)
+        action = np.zeros(len(layout.joints) + len(layout.grippers))
         if not layout.relative:
             action[layout.joints] = layout.measured(obs)
         spec = self._contract.action
@@ -539,19 +536,22 @@ class _Suite:
         if not self._agreed("closing and opening the gripper"):
             return
         action = self._hold_command(layout, obs)
-        openings = []
-        for goal in (spec.gripper_open, spec.gripper_closed, spec.gripper_open):
+
+        def opening(goal: float | None) -> float:
             action[layout.grippers] = goal
             self._apply(action)
             self._clock.sleep(2.0)
-            openings.append(self._observe().gripper or 0.0)
-            saw = self._operator.saw_closing() if self._operator is not None and goal == spec.gripper_closed else None
-            if len(openings) == 2 and saw is None:
-                self.report.skipped["gripper"] = "the operator could not tell whether it closed"
-            if len(openings) == 2 and (openings[1] > openings[0] - 0.3 or saw is False):
-                got = f"an opening of {openings[0]:.2g} before and {openings[1]:.2g} after the command to close"
-                cure = "exchange gripper_open and gripper_closed of the contract, and give 1 for open in observe"
-                self.find("gripper", got, "a gripper that closes, and a smaller opening", cure)
+            return self._observe().gripper or 0.0
+
+        before, after = opening(spec.gripper_open), opening(spec.gripper_closed)
+        saw = None if self._operator is None else self._operator.saw_closing()
+        if saw is None:
+            self.report.skipped["gripper"] = "the operator could not tell whether it closed"
+        if after > before - 0.3 or saw is False:
+            got = f"an opening of {before:.2g} before and {after:.2g} after the command to close"
+            cure = "exchange gripper_open and gripper_closed of the contract, and give 1 for open in observe"
+            self.find("gripper", got, "a gripper that closes, and a smaller opening", cure)
+        opening(spec.gripper_open)
         self._passes("gripper")
 
 
@@ -559,7 +559,6 @@ class _Suite:
 class _Layout:
     """The numbers of an action, and the parts of the state that measure them."""
 
-    dim: int
     names: list[str]  # of the joints
     limits: np.ndarray  # (D, 2), of the joints; infinite if the robot has no `joint_limits`
     joints: list[int]  # their numbers in an action
@@ -580,15 +579,10 @@ class _Layout:
         each = (action.dim - sum(counts)) // max(1, len(parts))
         if not parts or each not in (0, 1) or sum(counts) + each * len(parts) != action.dim:
             return None
-        joints: list[int] = []
-        grippers: list[int] = []
-        poses: list[str | None] = []
-        for part, count in zip(parts, counts, strict=True):
-            at = len(joints) + len(grippers)
-            joints += range(at, at + count)
-            grippers += range(at + count, at + count + each)
-            pose = part.replace("joints", "tquat")
-            poses += [pose if pose in obs.state else None] * count
+        grippers = [int(end) - 1 for end in np.cumsum(counts) + each * np.arange(1, len(parts) + 1)] if each else []
+        joints = [number for number in range(action.dim) if number not in grippers]
+        hands = [pose if (pose := part.replace("joints", "tquat")) in obs.state else None for part in parts]
+        poses = [hand for hand, count in zip(hands, counts, strict=True) for _ in range(count)]
         names = list(getattr(robot, "joint_names", ()))
         if len(names) != len(joints):
             names = [f"joint {number}" for number in range(len(joints))]
@@ -596,7 +590,7 @@ class _Layout:
         if limits.shape != (len(joints), 2):
             raise ConfigError(f"joint_limits: got {limits.shape}, want ({len(joints)}, 2), a low and a high for each")
         unit = ((contract.state or {}).get(parts[0]) or StateSpec()).unit or "rad"
-        return cls(action.dim, names, limits, joints, grippers, parts, poses, unit, bool(action.relative))
+        return cls(names, limits, joints, grippers, parts, poses, unit, bool(action.relative))
 
     @property
     def step(self) -> float:

@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 
+from vlagents_ray.contract import reordered
 from vlagents_ray.errors import ConfigError, ContractMismatch
 from vlagents_ray.interface import Obs
 from vlagents_ray.robot.limits import Limits
@@ -66,10 +67,11 @@ class Trained:
         return cls(state, action, tuple(stated["parts"]) if "parts" in stated else None)
 
     def vector(self, obs: Obs, parts: Sequence[str]) -> np.ndarray | None:
-        """Return the state in the order of the training, else of `parts`, (D,); None if it has none of them."""
-        have = {**obs.state, **({} if obs.gripper is None else {"gripper": np.array([obs.gripper])})}
-        named = [have[part] for part in (parts if self.parts is None else self.parts) if part in have]
-        return np.concatenate(named) if named else None
+        """Return the state in the order of the training, else of `parts`, (D,); None if it lacks one of them."""
+        have, wanted = dict(obs.state), parts if self.parts is None else self.parts
+        if obs.gripper is not None:
+            have |= {"gripper": np.array([obs.gripper]), "gripper_closed": np.array([1 - obs.gripper])}
+        return np.concatenate([have[part] for part in wanted]) if wanted and have.keys() >= set(wanted) else None
 
     def misfits(
         self, state: np.ndarray | None, chunk: np.ndarray | None, limits: Limits | None, names: Sequence[str] = ()
@@ -82,39 +84,30 @@ class Trained:
             limits: The limits of the arm.
             names: The names of the numbers by the arm's driver; default: those of `limits`.
         """
-        stated = [] if limits is None else [one.removesuffix(".pos") for one in limits.joints]
-        found, names = [], [one.removesuffix(".pos") for one in names] or stated
-        for number, (ours, theirs) in enumerate(zip(names, stated, strict=False)):
-            if ours != theirs and ours in stated:
-                found.append(
-                    f"joints: number {number} is {ours!r} of the arm and {theirs!r} of its limits; use one order"
-                )
+        stated = () if limits is None else limits.joints
+        found = [
+            f"joints: number {number} is {ours!r} of the arm and {theirs!r} of its limits; use one order"
+            for number, ours, theirs in reordered(names, stated)
+        ]
+        names = [one.removesuffix(".pos") for one in names or stated]
         if self.state is not None and state is not None:
             found += _outside("state", state[np.newaxis], *self.state, names)
         if self.action is not None and chunk is not None:
             found += _outside("first chunk", chunk, *self.action, names)
         if limits is not None and self.action is not None:
-            for bound, trained, sign in ((limits.low, self.action[0], -1), (limits.high, self.action[1], 1)):
-                if bound is None or np.shape(bound) not in ((), trained.shape):
-                    continue
-                for i in np.flatnonzero(sign * (trained - np.asarray(bound, np.float64)) > 0):
-                    limit = np.broadcast_to(bound, trained.shape)[i]
+            for limit, trained, sign in zip(limits.bounds(len(self.action[0])), self.action, (-1, 1), strict=True):
+                for i in np.flatnonzero(sign * (trained - limit) > 0):
                     found.append(
                         f"action{_name(int(i), names)}: was trained to {trained[i]:.4g}, the arm's limit is "
-                        f"{limit:.4g}; are they of another arm, or in another order?"
+                        f"{limit[i]:.4g}; are they of another arm, or in another order?"
                     )
         return found
 
     def drawn(self, chunk: np.ndarray, limits: Limits | None, names: Sequence[str] = ()) -> list[str]:
         """Draw the first chunk, (H, D), beside the training's actions and the limits: a line for each number."""
         dim = chunk.shape[1]
-        bounds = limits or Limits()
-        ends = [(bounds.low, -np.inf), (bounds.high, np.inf)]
-        low, high = (one if one is not None and np.shape(one) in ((), (dim,)) else free for one, free in ends)
-        spans: list[Span] = [(np.broadcast_to(low, dim), np.broadcast_to(high, dim))]
-        unknown = np.full(dim, -np.inf), np.full(dim, np.inf)
-        spans.append(unknown if self.action is None or len(self.action[0]) != dim else self.action)
-        spans.append((chunk.min(0), chunk.max(0)))
+        trained = Limits().bounds(dim) if self.action is None or len(self.action[0]) != dim else self.action
+        spans: list[Span] = [(limits or Limits()).bounds(dim), trained, (chunk.min(0), chunk.max(0))]
         lines = [
             f"{'first chunk (#), training (-), limits (.)':<{_WIDTH + 22}}{'chunk':>20}{'training':>20}{'limits':>20}"
         ]

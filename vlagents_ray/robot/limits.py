@@ -76,6 +76,14 @@ class Limits:
                 f"LeRobotDataset v3.0; see docs/control_loop.md"
             ) from error
 
+    def bounds(self, dim: int) -> tuple[np.ndarray, np.ndarray]:
+        """Return `low` and `high`, (dim,) each; infinite if there is none, or for another number of joints."""
+        ends, fitting = ((self.low, -np.inf), (self.high, np.inf)), ((), (dim,))
+        low, high = (
+            np.broadcast_to(one if one is not None and np.shape(one) in fitting else free, dim) for one, free in ends
+        )
+        return low, high
+
     def stricter(self, other: Limits) -> Limits:
         """Return these limits, each replaced by the other's where that is stricter."""
 

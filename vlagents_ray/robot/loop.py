@@ -21,6 +21,7 @@ import numpy as np
 from vlagents_ray.chunking.control import Control
 from vlagents_ray.chunking.fallback import Cause, Held
 from vlagents_ray.client.commands import CommandInbox
+from vlagents_ray.contract import Contract
 from vlagents_ray.errors import ConfigError, InvalidAction
 from vlagents_ray.interface import CAPTURED, CAUSE, INTERVENTION, SAFE, SILENT, WANTED, Act, Agent, Obs
 from vlagents_ray.robot.pacing import KEPT_TICKS, Pacer, jitter, undisturbed
@@ -64,6 +65,12 @@ class Robot(Protocol):
 
     def stop(self) -> None:
         """Bring the robot to rest from any state; may be called repeatedly, and from another thread."""
+
+
+def contract_of(robot: Robot) -> Contract:
+    """Return what a robot states of itself, with the names of its joints; empty if it states nothing."""
+    stated, names = getattr(robot, "contract", None) or Contract(), tuple(getattr(robot, "joint_names", ()))
+    return replace(stated, action=replace(stated.action, names=stated.action.names or names or None))
 
 
 def import_class(option: str, name: str, methods: Sequence[str] = ()) -> Any:

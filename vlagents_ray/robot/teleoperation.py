@@ -341,10 +341,9 @@ class Terminal:
             if self._own[-1] != consumer:
                 return True
             while self._is_in_foreground() and select.select([self.descriptor], [], [], 0)[0]:
-                try:
+                typed = b""
+                with contextlib.suppress(OSError):
                     typed = os.read(self.descriptor, 1024)
-                except OSError:
-                    return False
                 if not typed:
                     return False
                 for key in typed.decode(errors="replace").lower().replace("\r", "\n"):

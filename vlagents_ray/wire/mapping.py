@@ -437,9 +437,11 @@ class KeyMapping:
     def actions(self, action: np.ndarray, spec: ActionSpec | None = None) -> dict[str, np.ndarray]:
         """Return `rows` by the names that the client reads, each (H, n); as `action` if the mapping names none."""
         rows = self.rows(action, spec)
-        if not self.action:
-            return {"action": rows}
-        return {name: rows[:, one.start : one.stop] for name, one in self.action.items()}
+        return self.columns(rows) or {"action": rows}
+
+    def columns(self, rows: np.ndarray) -> dict[str, np.ndarray]:
+        """Return the columns of (H, D) rows, or of a row (D,), by the client's names; none if the mapping has none."""
+        return {name: rows[..., one.start : one.stop] for name, one in self.action.items()}
 
     def lacks(self, contract: Contract | None) -> list[str]:
         """Return the policy's inputs that no observation of this mapping has, each as a sentence with the cure."""

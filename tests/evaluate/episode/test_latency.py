@@ -19,7 +19,7 @@ from vlagents_ray.evaluate.episode.latency import ChunkExecutor
 from vlagents_ray.evaluate.episode.records import EpisodeResult
 from vlagents_ray.evaluate.plan.config import ClockConfig
 from vlagents_ray.evaluate.plan.jobs import EpisodeKey
-from vlagents_ray.interface import DELAY, LEFTOVER, Act, Obs
+from vlagents_ray.interface import DELAY, GIVEN, LEFTOVER, Act, Obs
 
 RELATIVE = Contract(action=ActionSpec(dim=2, delta=True, gripper_open=1.0), control_hz=10.0)
 ABSOLUTE = Contract(action=ActionSpec(dim=2, delta=False), control_hz=10.0)
@@ -139,6 +139,16 @@ def test_a_policy_that_chunks_in_real_time_is_told_what_is_left_and_for_how_long
 
     assert told(real_time_chunking=True) == [((), None), ((3, 1), 2)]
     assert told() == [((), None)] * 2
+
+
+def test_an_answer_later_than_the_rows_it_was_given_is_dropped() -> None:
+    player = ChunkExecutor(2, clock(real_time_chunking=True, neutral=[0, 0]), RELATIVE)
+    assert played(player, 0.0) == [1, 2]
+    late = [float(tick.action[0]) for tick in player.ticks(10 + CHUNK, 0.3, {GIVEN: 2})]
+    assert late == [3, 4, 5]
+    assert player.request_info()[LEFTOVER].shape == (1, 2), "the plan goes on"
+    in_time = [float(tick.action[0]) for tick in player.ticks(10 + CHUNK, 0.1, {GIVEN: 2})]
+    assert in_time == [6, 12]
 
 
 def episode(seed: int, timing: ClockConfig | None, execute: int | None = None) -> EpisodeResult:

@@ -23,6 +23,7 @@ from vlagents_ray.interface import DISTRIBUTION, SAMPLES, Act
 from vlagents_ray.policies.base.checkpoint import used_checkpoints
 from vlagents_ray.policies.gr00t import Gr00t, built_without_flash_attention, packed_attention
 from vlagents_ray.policies.sampling_rng import RowDraws
+from vlagents_ray.robot.fit import Trained
 from vlagents_ray.testing import check_agent
 
 pytestmark = MARKS
@@ -204,6 +205,10 @@ def test_samples_are_draws_of_their_own(policy_of: Policy) -> None:
 
 def test_the_checkpoints_metadata_are_the_contract(policy_of: Policy) -> None:
     relative, libero = policy_of("relative").contract, policy_of("libero", embodiment=tiny.LIBERO).contract
+    stated = Trained.from_statistics(policy_of("relative").statistics)
+    assert stated.parts == ("arm", "gripper")
+    assert stated.state is not None
+    assert [len(low) for low in stated.state] == [6, 6]
     assert relative.cameras == {"ego_view": CameraSpec()}
     assert (relative.state, relative.gripper, relative.instruction) == ({"arm": StateSpec(5)}, True, True)
     assert relative.action == ActionSpec(dim=6, space="joint", delta=False)

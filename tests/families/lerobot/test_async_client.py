@@ -8,6 +8,7 @@ import sys
 from pathlib import Path
 
 import numpy as np
+import pytest
 from in_process_replicas import Replicas
 
 from tests.families.lerobot import robot_client
@@ -25,6 +26,7 @@ pytestmark = FILTERS
 ACTIONS = 20
 
 
+@pytest.mark.program("LeRobot asynchronous inference")
 def test_it_performs_the_policys_actions(loaded: Load, made: Made, tmp_path: Path) -> None:
     replicas = Replicas([LeRobot.from_config({"checkpoint": str(made("act"))})])
     cls, port, contract = dialect_class("lerobot"), free_port(), loaded("act").contract

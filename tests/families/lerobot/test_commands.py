@@ -74,6 +74,7 @@ def ended(server: Server, tmp_path_factory: pytest.TempPathFactory) -> dict[str,
 
 
 @BY_RECORD
+@pytest.mark.program("LeRobot lerobot-record")
 def test_lerobot_record_records_the_actions_of_the_servers_policy(ended: dict[str, Ended]) -> None:
     done = ended["record"]
     assert done.status == 0, done.log
@@ -92,6 +93,7 @@ def test_lerobot_record_records_the_actions_of_the_servers_policy(ended: dict[st
             np.testing.assert_array_equal(step.expected[0], chunk[step.frame % ROWS])
 
 
+@pytest.mark.program("LeRobot lerobot-eval")
 def test_lerobot_eval_gives_each_environment_a_session_of_its_own(ended: dict[str, Ended]) -> None:
     done = ended["eval"]
     assert done.status == 0, done.log

@@ -97,6 +97,15 @@ def test_the_ranges_of_the_training_are_stated(loaded: Load) -> None:
         np.testing.assert_allclose(stated[key]["min"], made[key]["min"], rtol=1e-6)
 
 
+def test_the_names_of_the_joints_are_those_of_the_training(loaded: Load, monkeypatch: pytest.MonkeyPatch) -> None:
+    policy, names = loaded("act"), [f"joint{number}.pos" for number in range(tiny.ACTION)]
+    model = policy.model
+    monkeypatch.setattr(model.kind.config, "action_feature_names", names, raising=False)  # as LeRobot 0.6 saves it
+    found = policy._described(model.kind, model.processors, model.trained, {})
+    assert found.contract.action.names == tuple(names)
+    assert policy.contract.action.names is None
+
+
 def test_images_of_any_size_meet_in_a_batch_of_a_policy_that_resizes(loaded: Load) -> None:
     policy = loaded("smolvla")
     sides = [64, 96, 64]

@@ -16,7 +16,7 @@ from tests.families.lerobot import tiny
 from tests.families.lerobot.conftest import begun, view
 from tests.families.lerobot.test_pi import _loaded, _normalised, shrunk  # noqa: F401 - a fixture
 from tests.families.lerobot.test_upstream import Theirs, draws_of
-from vlagents_ray.interface import DELAY, LEFTOVER
+from vlagents_ray.interface import DELAY, GIVEN, LEFTOVER
 from vlagents_ray.policies.lerobot.kinds import LONGEST_PREFIX
 
 LONGEST = 4
@@ -51,7 +51,9 @@ def test_given_prefixes_are_theirs(delay: int, mode: str, trained: Path) -> None
         "inference_delay": delay,
     }
     wanted = theirs.after(theirs.policy.predict_action_chunk(theirs.see(view()), **given))[0].detach().numpy()
-    ours = begun(policy).act(view(**{LEFTOVER: plan, DELAY: delay})).action
+    act = begun(policy).act(view(**{LEFTOVER: plan, DELAY: delay}))
+    ours = act.action
+    assert act.info.get(GIVEN) == (delay if mode == "trained" else None)
     np.testing.assert_allclose(ours, wanted, atol=1e-4)
     if mode == "trained":
         np.testing.assert_allclose(ours[:delay], plan[:delay], atol=1e-5)

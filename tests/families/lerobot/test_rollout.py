@@ -97,6 +97,7 @@ def policys(sent: list[dict[str, Any]]) -> int:
     return found
 
 
+@pytest.mark.program("LeRobot lerobot-rollout with RTC")
 def test_a_rollout_executes_the_actions_of_the_servers_policy(rollouts: dict[str, Rollout]) -> None:
     done = rollouts["base"]
     assert done.status == 0, done.log
@@ -123,6 +124,7 @@ def test_dagger_records_the_corrections_and_begins_an_episode_after_each(rollout
     assert pyarrow.parquet.read_table(file)["intervention"].to_pylist() == [True] * len(whole)
 
 
+@pytest.mark.program("LeRobot lerobot-rollout with RTC")
 def test_real_time_chunking_sends_the_plan_that_is_executed(rollouts: dict[str, Rollout]) -> None:
     done = rollouts["rtc"]
     assert done.status == 0, done.log

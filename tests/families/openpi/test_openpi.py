@@ -14,6 +14,7 @@ from vlagents_ray import Act, Obs
 from vlagents_ray.errors import ConfigError, InvalidObservation, MissingCamera
 from vlagents_ray.interface import DELAY, DISTRIBUTION, LEFTOVER, SAMPLES
 from vlagents_ray.policies.base import policy as base_policy
+from vlagents_ray.robot.fit import Trained
 from vlagents_ray.serve.config.dialects import presets
 from vlagents_ray.testing import check_agent
 
@@ -72,6 +73,17 @@ def test_actions_are_those_of_openpis_own_policy(kind: str, loaded: Any, upstrea
         noise = np.random.default_rng([0, i]).standard_normal(policy.model.model.noise_shape, dtype=np.float32)
         want = theirs_policy.infer({**theirs(kind, i), "prompt": WORDS[i]}, noise=noise)["actions"]
         np.testing.assert_allclose(begun(policy, kind, i).act(seen(kind, i)).action, want, atol=1e-4, rtol=1e-4)
+
+
+@pytest.mark.parametrize(("kind", "known"), [("pi0", (8, 1)), ("pi05", (8, 8)), ("aloha", (12, 2)), ("fast", (8, 8))])
+def test_the_ranges_of_the_training_are_in_the_robots_units(kind: str, known: tuple[int, int], loaded: Any) -> None:
+    trained = Trained.from_statistics(loaded(kind).statistics)
+    assert trained.state is not None
+    assert trained.action is not None
+    assert (np.isfinite(trained.state[0]).sum(), np.isfinite(trained.action[0]).sum()) == known
+    state = trained.vector(seen(kind, 0), [])
+    assert state is not None
+    assert len(state) == len(trained.state[0])
 
 
 @pytest.mark.verifies("batches")

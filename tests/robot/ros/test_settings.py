@@ -49,7 +49,7 @@ def test_types_and_limits_have_defaults_and_an_action_the_numbers_of_all_its_top
         "sensor_msgs/msg/JointState",
         ("a", "b"),
     )
-    assert (settings.max_age_of(front), settings.silent_of(front), settings.dim) == (0.3, 1.0, 2)
+    assert (front.max_age_s, front.silent_s, settings.dim) == (0.3, 1.0, 2)
     actions = [
         {"topic": "/t", "type": "trajectory_msgs/msg/JointTrajectory", "names": ["a", "b"], "stop": "joints"},
         {"topic": "/g", "type": "sensor_msgs/msg/JointState", "names": ["finger"], "stop": "nothing"},

@@ -93,6 +93,28 @@ def test_until_the_policy_is_loaded_every_dialect_answers_503() -> None:
             assert refused.value.status_code == 503
 
 
+@pytest.mark.parametrize(
+    ("settings", "want"),
+    [
+        ({"chunk": True, "plain": True}, [[3, 0, 1, 1, 0], [3, 0, 1, 1, 1]]),
+        ({"plain": True}, [3, 0, 1, 1, 0]),
+        ({"chunk": True, "mapping": {"preset": "openvla", "action": {"actions": {"stop": 5}}}}, {"actions": (2, 5)}),
+        (
+            {"mapping": {"preset": "openvla", "action": {"arm": {"stop": 6}, "hand": {"start": 6}}}},
+            {"arm": (6,), "hand": (1,)},
+        ),
+    ],
+)
+def test_an_action_over_http_is_lists_or_named_columns_where_clients_read_those(settings: Any, want: Any) -> None:
+    with serving(Mirror(chunk=2), {"openvla": settings}) as (client, _):
+        answer = client.post("/act", json=body(3))
+    if isinstance(want, dict):
+        value = openvla_codec.decode(answer.content)[0]
+        assert {name: array.shape for name, array in value.items()} == want
+    else:
+        assert np.array(answer.json())[..., :5].tolist() == want
+
+
 def test_a_dialect_that_is_off_is_not_there() -> None:
     with serving(Mirror(), {"openvla": {}}) as (client, _):
         for path in ("/", "/openpi", "/vla-eval"):

@@ -186,6 +186,17 @@ def test_an_old_roboarena_client_gets_the_array_itself() -> None:
         assert openpi.decode(openpi.encode({"": 0})[:-1] + data)[""].shape == (1, 7)
 
 
+def test_the_mapping_names_the_actions_of_a_reply_as_a_client_reads_them() -> None:
+    mapping = {"preset": "openpi-libero", "action": {"arm": {"stop": 6}, "hand": {"start": 6}}}
+    with serving(Mirror(), {"openpi": {"mapping": mapping}}) as (client, _), client.websocket_connect("/") as socket:
+        socket.receive_bytes()
+        answer = call(socket, libero(3))
+        assert (answer["arm"].shape, answer["hand"].shape) == ((1, 6), (1, 1))
+        assert answer.keys() == {"arm", "hand", "policy_timing", "server_timing"}
+        batched = call(socket, openpi.encode({"batch": [openpi.decode(libero(3)), openpi.decode(libero(5))]}))
+        assert batched["arm"][:, 0, 0].tolist() == [3, 5]
+
+
 def test_a_session_that_was_forgotten_begins_again(context: tuple[TestClient, Engine]) -> None:
     client, engine = context
     with client.websocket_connect("/openpi") as socket:

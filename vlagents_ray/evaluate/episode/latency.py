@@ -9,7 +9,7 @@ begin with (`vlagents_ray.chunking.buffer.ChunkBuffer`). A synchronous evaluatio
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -74,8 +74,8 @@ class ChunkExecutor:
         """Return the `Obs.info` for real-time chunking: the remaining rows; {} if there are none or it is off."""
         return self._plan.continuation(self._delay.ticks) if self._clock.real_time_chunking else {}
 
-    def ticks(self, rows: np.ndarray, latency_s: float) -> Iterator[Tick]:
-        """Return the ticks until the next request, after an answer of `rows`, (H, D), with `latency_s`.
+    def ticks(self, rows: np.ndarray, latency_s: float, info: Mapping[str, Any] | None = None) -> Iterator[Tick]:
+        """Return the ticks until the next request, after an answer of `rows`, (H, D), with `latency_s` and `info`.
 
         Raises:
             ConfigError: No row is left for real-time chunking.
@@ -94,6 +94,8 @@ class ChunkExecutor:
         for tick in self._waiting(wait, rows.shape[1]):
             self._last = tick.action
             yield tick
+        if self._plan.outruns(asked, info or {}):
+            return
         # The last row is always executed, else a policy slower than its chunks would never act.
         late = self._plan.executed - len(rows) + 1
         self._plan.replace(rows, max(asked, late) if self._clock.align else None)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import base64
 import collections
 import itertools
 import os
@@ -17,7 +16,7 @@ from vlagents_ray.errors import ConfigError
 from vlagents_ray.evaluate.artifacts.storage import outcome
 from vlagents_ray.evaluate.results.reader import Attempt, CellResults, Episode, Results
 from vlagents_ray.evaluate.results.summary import errors_of_policies
-from vlagents_ray.images.jpeg_png import encode_jpeg
+from vlagents_ray.images.jpeg_png import data_url, encode_jpeg
 from vlagents_ray.registry import require
 
 BUDGET = 24 * 2**20  # bytes of videos that one page carries
@@ -204,8 +203,3 @@ def poster(frame: np.ndarray) -> str:
     """Return a data: URL of `frame`, (H, W, 3) uint8 RGB, as a JPEG; a large frame is scaled down."""
     stride = -(-max(frame.shape[:2]) // POSTER)
     return data_url("image/jpeg", encode_jpeg(np.ascontiguousarray(frame[::stride, ::stride]), quality=75))
-
-
-def data_url(kind: str, data: bytes) -> str:
-    """Return a URL with `data` of the media type `kind`."""
-    return f"data:{kind};base64,{base64.b64encode(data).decode()}"

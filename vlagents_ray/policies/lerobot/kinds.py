@@ -7,11 +7,10 @@ call its stateless functions, and pass them the state of each session.
 from __future__ import annotations
 
 import inspect
-import logging
 from collections.abc import Mapping, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import replace
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 
@@ -26,23 +25,19 @@ from vlagents_ray.policies.compilation import Compilation
 from vlagents_ray.policies.flow import Change, FlowPasses, Guide, Pi0Passes, RandomSteps, cache_of, layers_of
 from vlagents_ray.registry import require
 
-log = logging.getLogger(__name__)
-
 LONGEST_PREFIX = "rtc_training_max_delay"  # the config's field, of LeRobot after 0.6.1, for π0.5; 0: without prefixes
 _MEMORIES = ("use_visual_memory", "use_proprioceptive_memory")  # fields of π0.5's config in the same versions
-IMAGES = "observation.images"
-FRAMES = (
-    "observation.state",
-    "observation.environment_state",
-    IMAGES,
-)  # inputs of each step of a history
+STATE, ACTION, IMAGES = "observation.state", "action", "observation.images"
+FRAMES = (STATE, "observation.environment_state", IMAGES)  # inputs of each step of a history
 
 
 class Kind:
     """The default for any type: one row at a time with a seed from its session, which is slow but exact."""
 
     batched = False
+    lengths: ClassVar[tuple[str, ...]] = ("chunk_size", "n_action_steps")  # the config's rows of a chunk, by preference
     random: RandomSteps | None = None  # of the last sampled chunks
+    given: Mapping[int, int] = {}  # number of rows that the last sampled chunks were given, by the row of the batch
 
     def __init__(self, policy: Any, compilation: Compilation) -> None:
         """Use a loaded policy, and mark its core functions for compilation if its type has any."""
@@ -62,7 +57,7 @@ class Kind:
     @property
     def horizon(self) -> int:
         """The number of rows of a chunk, counted from the current tick."""
-        return int(getattr(self.config, "chunk_size", 0) or self.config.n_action_steps)
+        return int(getattr(self.config, self.lengths[0], 0) or getattr(self.config, self.lengths[-1]))
 
     @property
     def dim(self) -> int:
@@ -206,7 +201,6 @@ class Flow(Kind):
         trained = getattr(policy.rtc_processor.rtc_config, "mode", "guided") == "trained"
         self.longest = int(getattr(policy.config, LONGEST_PREFIX)) if trained else 0  # rows of a prefix
         self.passes.by_row = trained
-        self._told = False  # that a delay is longer
 
     @property
     def flow_steps(self) -> int:
@@ -224,11 +218,12 @@ class Flow(Kind):
         noise = convert(np.stack([row.noise(*shape) for row in rows]))
         self.random = RandomSteps.of(rows, (self.flow_steps, *shape), self.noise_level, convert)
         changes: list[Change] = []
-        given = None
+        given, self.given = None, {}
         if any(left is not None for left in leftovers):
             plans = [None if left is None else self._encoded(left) for left in leftovers]
             prefixes = Guide.of(list(map(self._prefixed, rows, plans)), *shape) if self.longest else None
             if prefixes is not None:
+                self.given = {i: int(prefixes.frozen[i].sum()) for i, plan in enumerate(plans) if plan is not None}
                 prefixes = prefixes.to(convert)
                 noise, given = prefixes.given(noise), prefixes.frozen
                 changes.append(prefixes.keep)
@@ -254,15 +249,6 @@ class Flow(Kind):
 
     def _prefixed(self, row: Row, plan: Any) -> Row:
         """Return the row with its plan in the policy's units, and the number of its rows that are given."""
-        if row.delay > self.longest and not self._told:
-            self._told = True
-            log.warning(
-                "real-time chunking: got a delay of %d ticks, want at most %d, the checkpoint's %s, else chunks begin "
-                "with a jump; lower the latency or the control rate, or set overrides: {rtc_config: {mode: guided}}",
-                row.delay,
-                self.longest,
-                LONGEST_PREFIX,
-            )
         delay = min(row.delay or self.longest, self.longest)  # before the first answer its delay is unknown
         return replace(row, leftover=None if plan is None else fetch(plan), delay=delay)
 
@@ -379,7 +365,6 @@ class SmolVLAPasses(FlowPasses):
         return self._positions[size]
 
 
-STATE, ACTION = "observation.state", "action"
 _BOUNDS = ("min", "max")  # statistics that scale states and actions
 
 
@@ -495,9 +480,7 @@ class ActPolicy(Kind):
 class Fast(Kind):
     """π0-FAST, which decodes only the tokens of rows that are executed."""
 
-    @property
-    def horizon(self) -> int:
-        return int(self.config.n_action_steps)
+    lengths = ("n_action_steps",)
 
 
 class Evo1(Kind):
@@ -534,16 +517,12 @@ class XVla(Kind):
 class VqBet(Kind):
     """VQ-BeT, which samples the codes of its residual VQ; checkpoints of its first training phase have no codes."""
 
-    batched = True
+    batched, lengths = True, ("action_chunk_size",)
 
     def __init__(self, policy: Any, compilation: Compilation) -> None:
         super().__init__(policy, compilation)
         if not policy.vqbet.action_head.vqvae_model.discretized.item():
             raise ConfigError("checkpoint: VQ-BeT's residual VQ is not trained in it; train on, or name a later step")
-
-    @property
-    def horizon(self) -> int:
-        return int(self.config.action_chunk_size)
 
     def draw(self, batch: dict[str, Any], rows: Sequence[Row], leftovers: Sequence[Any]) -> Any:
         with row_draws(rows, self.policy.vqbet):

@@ -13,7 +13,7 @@ import numpy as np
 from vlagents_ray.contract import ActionSpec, CameraSpec, Contract
 from vlagents_ray.dataset_contract import DatasetContract, angles_in, centre_between, usual_unit
 from vlagents_ray.errors import ConfigError
-from vlagents_ray.interface import Obs
+from vlagents_ray.interface import GIVEN, Obs
 from vlagents_ray.policies.base import ModelPolicy, Prediction, Row, model_inputs
 from vlagents_ray.policies.base.accelerator import torch_device
 from vlagents_ray.policies.base.model_code import remote_code
@@ -21,7 +21,8 @@ from vlagents_ray.policies.base.staging import StagedRow
 from vlagents_ray.policies.flow import OFFERED
 from vlagents_ray.policies.lerobot import checkpoint, kinds
 from vlagents_ray.policies.lerobot.config import LeRobotConfig
-from vlagents_ray.policies.lerobot.processors import ACTION, STATE, Processors, own_processors
+from vlagents_ray.policies.lerobot.kinds import ACTION, STATE
+from vlagents_ray.policies.lerobot.processors import Processors, own_processors
 from vlagents_ray.policies.outcomes import attempt
 from vlagents_ray.registry import require
 
@@ -124,6 +125,9 @@ class LeRobot(ModelPolicy):
         environment = list(trained.environment or [ENVIRONMENT_STATE]) if settings.env_state_feature else []
         width = processors.width(kind.dim)
         action, known = trained.contract.action, trained.contract.state or {}
+        action = action if action.dim == width else ActionSpec(dim=width)
+        if len(names := getattr(settings, "action_feature_names", None) or ()) == width:
+            action = replace(action, names=tuple(names))
         state = model_inputs.state_specs(parts, settings.robot_state_feature.shape[0]) if parts else {}
         if tuple(parts) == trained.state:
             state |= known
@@ -133,7 +137,7 @@ class LeRobot(ModelPolicy):
             state=state | {part: known.get(part, spec) for part, spec in around.items()},
             gripper=model_inputs.needs_gripper(parts),
             instruction=processors.instructed or None,
-            action=action if action.dim == width else ActionSpec(dim=width),
+            action=action,
             control_hz=trained.contract.control_hz,
             chunk=self.chunk(kind.horizon),
             history=kind.steps,
@@ -201,7 +205,8 @@ class LeRobot(ModelPolicy):
                     chunks[places] = own.actions(drawn[places])
             dim = settings.action_feature.shape[0]
             stated = {} if kind.random is None else kind.random.stated(self.config.execute, dim)
-        return [Prediction(chunk, behaviour=stated.get(i, {})) for i, chunk in enumerate(chunks)]
+        given = [{GIVEN: kind.given[i]} if i in kind.given else {} for i in range(len(rows))]
+        return [Prediction(chunk, behaviour=stated.get(i, {}), info=given[i]) for i, chunk in enumerate(chunks)]
 
 
 def _of(adapter: str, rows: Sequence[Row]) -> list[int]:

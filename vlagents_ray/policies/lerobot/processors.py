@@ -18,11 +18,10 @@ from vlagents_ray.policies.base.model_code import CURE
 from vlagents_ray.policies.base.model_inputs import keeping_tokens
 from vlagents_ray.policies.base.staging import Staging
 from vlagents_ray.policies.lerobot.config import LeRobotConfig
-from vlagents_ray.policies.lerobot.kinds import groot_dataset, require_groot_statistics
+from vlagents_ray.policies.lerobot.kinds import ACTION, STATE, groot_dataset, require_groot_statistics
 from vlagents_ray.registry import require
 
 PIPELINES = ("policy_preprocessor.json", "policy_postprocessor.json")
-STATE, ACTION = "observation.state", "action"
 _NAME = "tokenizer_name"  # a hub id, or a folder of the trainer's
 _DEVICE, _RENAME, _TOKENIZER = "device_processor", "rename_observations_processor", "tokenizer_processor"
 _GROOT_TOKENIZER = "groot_n1_7_vlm_encode_v1"

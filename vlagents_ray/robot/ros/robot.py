@@ -34,6 +34,7 @@ POSES = ("geometry_msgs/msg/Pose", "geometry_msgs/msg/PoseStamped")
 NUMBERS = tuple(f"std_msgs/msg/{name}" for name in ("Float64MultiArray", "Float32MultiArray", "Float64", "Float32"))
 ARRAY, TWIST_TYPE, TRAJECTORY = NUMBERS[0], "geometry_msgs/msg/Twist", "trajectory_msgs/msg/JointTrajectory"
 ZEROS, NOTHING = "zeros", "nothing"
+_AGES = ("max_age_s", "silent_s")
 
 
 @dataclass(frozen=True)
@@ -47,8 +48,8 @@ class InputTopic:
     rotation: PoseRotation = "quat_xyzw"  # form of the rotation of a pose
     open: float | None = None  # of the gripper: the number at which it is open
     closed: float | None = None
-    max_age_s: float | None = None  # without a newer message the robot holds still; None: the file's
-    silent_s: float | None = None  # without a newer message the robot is stopped; None: the file's
+    max_age_s: float = 0.3  # without a newer message the robot holds still
+    silent_s: float = 1.0  # without a newer message the robot is stopped
 
 
 @dataclass(frozen=True)
@@ -90,8 +91,6 @@ class RosSettings:
     state: Mapping[str, InputTopic] = field(default_factory=dict)
     gripper: InputTopic | None = None
     heartbeat: HeartbeatTopic | None = None
-    max_age_s: float = 0.3
-    silent_s: float = 1.0
     clock: str = "stamp"  # whether a message's age counts from its header's time stamp, or from its arrival ("arrival")
     ready_s: float = 10.0  # time limit for the first message of each topic
 
@@ -104,14 +103,6 @@ class RosSettings:
     def dim(self) -> int:
         """The count of numbers of an action."""
         return sum(command.dim for command in self.actions)
-
-    def max_age_of(self, reading: InputTopic) -> float:
-        """Return the time without a newer message after which the robot holds still, s."""
-        return self.max_age_s if reading.max_age_s is None else reading.max_age_s
-
-    def silent_of(self, reading: InputTopic) -> float:
-        """Return the time without a newer message after which the robot is stopped, s."""
-        return self.silent_s if reading.silent_s is None else reading.silent_s
 
 
 def read_settings(file: Path | str) -> RosSettings:
@@ -132,11 +123,12 @@ def read_settings(file: Path | str) -> RosSettings:
 def settings_from(stated: Any, where: str) -> RosSettings:
     """Check the decoded document of a file with the name `where`, and return it; raises `ConfigError`."""
     top = dict(_mapping(stated, where))
+    usual = {key: top.pop(key) for key in _AGES if key in top}  # of all readings
     for part, kind in (("cameras", IMAGE), ("state", JOINT_STATE)):
         named = _mapping(top.get(part) or {}, f"{where}: {part}")
-        top[part] = {str(name): _reading(one, f"{where}: {part}.{name}", kind) for name, one in named.items()}
+        top[part] = {str(name): _reading(one, f"{where}: {part}.{name}", kind, usual) for name, one in named.items()}
     if top.get("gripper") is not None:
-        top["gripper"] = _reading(top["gripper"], f"{where}: gripper", JOINT_STATE)
+        top["gripper"] = _reading(top["gripper"], f"{where}: gripper", JOINT_STATE, usual)
     if top.get("heartbeat") is not None:
         top["heartbeat"] = _made(HeartbeatTopic, top["heartbeat"], f"{where}: heartbeat")
     actions = top.get("actions") or []
@@ -172,11 +164,10 @@ def _check(settings: RosSettings, where: str) -> None:
         raise ConfigError(f"{where}: gripper: got no two numbers, want `open` and `closed` as the topic gives them")
     for i, command in enumerate(settings.actions):
         _check_command(command, settings, f"{where}: actions[{i}]")
-    limits = [(name, getattr(settings, name)) for name in ("max_age_s", "silent_s", "ready_s")]
-    limits += [(f"{name}: {key}", getattr(one, key)) for name, one, _ in readings for key in ("max_age_s", "silent_s")]
-    limits += [("heartbeat: hz", settings.heartbeat.hz)] if settings.heartbeat else []
+    limits = [("ready_s", settings.ready_s), *([("heartbeat: hz", beat.hz)] if (beat := settings.heartbeat) else [])]
+    limits += [(f"{name}: {key}", getattr(one, key)) for name, one, _ in readings for key in _AGES]
     for name, limit in limits:
-        if limit is not None and not limit > 0:
+        if not limit > 0:
             raise ConfigError(f"{where}: {name}: got {limit}, want above 0")
     _one_of(f"{where}: clock", settings.clock, ("stamp", "arrival"))
     if settings.link != ROS2 and not settings.link.startswith(("ws://", "wss://")):
@@ -203,8 +194,8 @@ def _check_command(command: ActionTopic, settings: RosSettings, where: str) -> N
         _one_of(f"{where}: stop", command.stop, (ZEROS, NOTHING, *settings.state))
 
 
-def _reading(stated: Any, where: str, kind: str) -> InputTopic:
-    reading: InputTopic = _made(InputTopic, {"type": kind, **_mapping(stated, where)}, where)
+def _reading(stated: Any, where: str, kind: str, usual: Mapping[str, Any]) -> InputTopic:
+    reading: InputTopic = _made(InputTopic, {"type": kind, **usual, **_mapping(stated, where)}, where)
     return reading
 
 
@@ -341,9 +332,13 @@ class RosRobot:
         """The sources for a `Watchdog`: each topic, and its longest time without a new message, s."""
         limits: dict[str, float] = {}
         for reading in self.settings.sensors:
-            limit = self.settings.silent_of(reading)
-            limits[reading.topic] = min(limit, limits.get(reading.topic, limit))
+            limits[reading.topic] = min(reading.silent_s, limits.get(reading.topic, math.inf))
         return limits
+
+    @property
+    def joint_names(self) -> list[str]:
+        """The joints in the order of an action, as far as the settings of its topics name them."""
+        return [name for topic in self.settings.actions for name in topic.names]
 
     @property
     def contract(self) -> Contract:
@@ -394,7 +389,7 @@ class RosRobot:
                 reading = self.settings.state[command.stop]
                 reader = self._readers[id(reading)]
                 reader.refresh()
-                if reader.age_s > self.settings.max_age_of(reading) or self._from_before_loss(reader):
+                if reader.age_s > reading.max_age_s or self._from_before_loss(reader):
                     self._stop_unsent = True  # until a pose is known
                     logger.warning("%s: not told where to stop, as %s is old", command.topic, reading.topic)
                 else:
@@ -423,9 +418,8 @@ class RosRobot:
         self.holds = f"the connection to the {self._link.name} was lost" if lost else None
         for reading in self.settings.sensors:
             reader = self._readers[id(reading)]
-            limit = self.settings.max_age_of(reading)
-            if reader.age_s > limit:
-                self.holds = self.holds or f"no new message of {reading.topic} for more than {limit:g} s"
+            if reader.age_s > reading.max_age_s:
+                self.holds = self.holds or f"no new message of {reading.topic} for more than {reading.max_age_s:g} s"
             if self.watchdog is not None and reader.age_s < math.inf:
                 self.watchdog.heard(reading.topic, max(0.0, reader.age_s))
         if self._stop_unsent and self.holds is None:
@@ -463,7 +457,7 @@ class RosRobot:
             time.sleep(_POLL_S)
         for reading in self.settings.sensors:
             ago_s = time.time() - self._readers[id(reading)].captured_at
-            if not -SKEW_S <= ago_s <= self.settings.silent_of(reading):
+            if not -SKEW_S <= ago_s <= reading.silent_s:
                 when = f"{abs(ago_s):.3g} s {'ahead' if ago_s < 0 else 'ago'}"
                 raise ConfigError(
                     f"{reading.topic}: got a message with the time stamp of {when}, want one of now; "

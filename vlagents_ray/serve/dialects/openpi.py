@@ -73,8 +73,8 @@ class MapDialect(base.RouteDialect):
         inference_ms = max(reply.timing["inference_ms"] for reply in replies)
         infer_ms = max(reply.timing["queue_ms"] + reply.timing["inference_ms"] for reply in replies)
         rows = [self.rows(reply) for reply in replies]
-        return {
-            "actions": _stacked(rows) if batched else rows[0],
+        actions = _stacked(rows) if batched else rows[0]
+        return (self.mapping.columns(actions) or {"actions": actions}) | {
             "policy_timing": {"infer_ms": inference_ms} | ({"batch_size": len(rows)} if batched else {}),
             "server_timing": {"infer_ms": infer_ms} | ({} if before_ms is None else {"prev_total_ms": before_ms}),
         }

@@ -25,6 +25,7 @@ class OpenVLADialectConfig(DialectConfig):
 
     mapping: MappingSetting = "openvla"
     chunk: bool = Field(default=False, description="answer all rows, as OFT's clients want it, not the first alone")
+    plain: bool = Field(default=False, description="answer lists of numbers, as GO-1's clients read them, not arrays")
 
 
 class OpenVLADialect(HttpDialect):
@@ -47,6 +48,10 @@ class OpenVLADialect(HttpDialect):
             return theirs
 
         def write(rows: np.ndarray) -> bytes:
-            return openvla.encode(list(rows) if self.config.chunk else rows[0], twice)
+            chosen = rows if self.config.chunk else rows[0]
+            if self.config.plain:
+                return openvla.encode(chosen.tolist(), twice)
+            named = self.mapping.columns(chosen)
+            return openvla.encode(named or (list(rows) if self.config.chunk else chosen), twice)
 
         return await self.answer(http, read, write)
