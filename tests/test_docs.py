@@ -112,7 +112,7 @@ def test_files_of_runs_on_the_pages_are_accepted() -> None:
         ("gymnasium#pusht", known("gym_pusht/PushT-v0").protocol),
         ("gymnasium#fetch-gymnasium-robotics", known("FetchReach-v4").protocol),
         ("robosuite#robosuite", TASKS["Lift"].protocol),
-        ("calvin", calvin.PROTOCOL),
+        ("other#calvin", calvin.PROTOCOL),
         ("robosuite#robocasa", robocasa.protocol("OpenDrawer", "target")),
     ],
 )

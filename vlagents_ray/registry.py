@@ -180,6 +180,7 @@ ENVS: dict[str, Adapter] = {
         requirements=("calvin",),
         wants="a checkout",
         tasks="/<scene>",
+        page="other#calvin",
     ),
     "robocasa": Adapter(
         "vlagents_ray.envs.robocasa:RoboCasa",
@@ -196,6 +197,7 @@ ENVS: dict[str, Adapter] = {
         requirements=("rcs",),
         wants="assets",
         tasks="/pick",
+        page="other#rcs-and-duobench",
     ),
     "duobench": Adapter(
         "vlagents_ray.envs.rcs:DuoBench",
@@ -203,7 +205,7 @@ ENVS: dict[str, Adapter] = {
         needs=("duobench",),
         requirements=("rcs",),
         wants="assets",
-        page="rcs",
+        page="other#rcs-and-duobench",
     ),
     "aloha": Adapter(
         "vlagents_ray.envs.aloha:Aloha",
