@@ -55,7 +55,7 @@ NOT_QUICK := ray or server or hosts or sim or vulkan or torch or gpu or browser 
 # lerobot06 wants Python 3.12, and TORCH_CUDA=1 where no index has a torch without CUDA for it: several GB.
 # calvin wants CALVIN_SRC, a checkout.
 # robocasa is only tested where it is named: 1.3 GB, and a minute.
-FAMILIES ?= libero libero_pro lerobot hf rcs ros
+FAMILIES ?= libero libero_pro lerobot hf rcs ros torchrl
 TESTED_IN_libero := libero robosuite
 TESTED_IN_hf := pi0 arro vjepa2_ac
 TESTED_IN_lerobot06 := lerobot gr00t
@@ -127,7 +127,7 @@ verified-%: $(VENV)-%/.installed
 	$(VENV)-$*/bin/python -m pytest -p no:cacheprovider -m verifies --verified $(addprefix tests/families/,$(or $(TESTED_IN_$*),$*))
 
 verified:
-	@$(MAKE) --no-print-directory $(addprefix verified-,$(filter-out libero libero_pro rcs,$(FAMILIES)))
+	@$(MAKE) --no-print-directory $(addprefix verified-,$(filter-out libero libero_pro rcs ros torchrl,$(FAMILIES)))
 	$(BIN)/python tests/support/verified.py
 
 # Each in an environment of its own; Stable-Baselines3 and TorchRL in folders beside the torch of this one. openpi's examples want OPENPI_SRC, and

@@ -34,15 +34,17 @@ from vlagents_ray.policies.reference.checkpoint import (
     NetworkSizes,
     normalised,
     pixels,
+    read_checkpoint,
     words_of,
 )
-from vlagents_ray.policies.reference.network import ReferenceNetwork
+from vlagents_ray.policies.reference.network import ReferenceNetwork, read_network
 from vlagents_ray.ray_tools.git_state import code_in
+from vlagents_ray.robot.episode import INTERVENTION_COLUMN
 from vlagents_ray.weights.safetensors import write_values
 
 BATCH = 256  # frames
 DRAWS = 4  # times that a frame's context is used in a step, each with noise of its own: they cost little
-RATE, DECAY, CLIP = 3e-3, 0.01, 1.0  # of AdamW, and the largest norm of a gradient
+RATE, DECAY, CLIP = 3e-3, 0.01, 1.0  # of AdamW from nothing, and the largest norm of a gradient
 WARM_UP = 200  # steps, after which the rate falls as a cosine
 OBJECTS = 1.0  # weight of the error of the places of objects, which teaches early what words mean in images
 AVERAGE = 0.999  # of the weights, per step; these are what is saved
@@ -64,14 +66,17 @@ class Frames:
     end: torch.Tensor  # (N,) int64, the first frame after the episode's
 
 
-def read(data: Path, cameras: dict[str, dict[str, str]], kept: Path, every: int = 1) -> tuple[Checkpoint, Frames]:
-    """Read the dataset of each robot in a folder.
+def read(
+    data: Path, cameras: dict[str, dict[str, str]], kept: Path, every: int = 1, start: Checkpoint | None = None
+) -> tuple[Checkpoint, Frames]:
+    """Read the dataset of each robot in a folder; of one with interventions, only these are trained with.
 
     Args:
         data: The folder, with a dataset for each robot.
         cameras: Of the network -> of the robot, by robot.
         kept: A file for the decoded images, which may be larger than the memory.
         every: One frame of so many of an episode is trained with: its neighbours are nearly the same.
+        start: The checkpoint that is trained further, whose words and units stay.
 
     Returns:
         What the checkpoint states, and the frames.
@@ -86,31 +91,34 @@ def read(data: Path, cameras: dict[str, dict[str, str]], kept: Path, every: int 
             contract = dataset.contract
             if contract is None:
                 raise typer.BadParameter(f"{data / robot}: was not exported by this project: its info has no contract")
+            parts = list(contract.state) if start is None else start.embodiments[robot].state
+            corrected = INTERVENTION_COLUMN in dataset.features
             for play in dataset.plays():
                 [episode] = play.parts
                 begun, total = len(texts), len(texts) + episode.length
                 for step in dataset.steps(episode, Names(), None):
-                    if step.frame % every == 0:
+                    if step.frame % every == 0 and (step.intervention or not corrected):
                         seen = (step.obs.cameras[names[name]] for name in CAMERAS)
                         file.write(np.stack([resize_with_pad(one, sizes.side, sizes.side) for one in seen]).tobytes())
                         places.append(begun + step.frame)
-                    own.append(state_vector(step.obs, contract.state))
+                    own.append(state_vector(step.obs, parts))
                     around.append(state_vector(step.obs, contract.environment))
                     actions.append(step.expected[0])
                 ends += [total] * episode.length
                 texts += [episode.instruction] * episode.length
             found, things = np.stack(own), np.stack(around)
-            robots[robot] = Embodiment(
-                cameras=names, state=list(contract.state), state_mean=found.mean(0).tolist(),
-                state_std=found.std(0).tolist(), action=contract.contract.to_json()["action"],
+            robots[robot] = start.embodiments[robot] if start is not None else Embodiment(
+                cameras=names, state=parts, state_mean=found.mean(0).tolist(), state_std=found.std(0).tolist(),
+                action=contract.contract.to_json()["action"],
             )  # fmt: skip
             states.append(normalised(robots[robot], found, sizes.state))
             objects.append((things - things.mean(0)) / np.maximum(things.std(0), 1e-2))
     words = sorted({word for text in set(texts) for word in words_of(text)})
-    checkpoint = Checkpoint(sizes=sizes.model_copy(update={"words": len(words)}), words=words, embodiments=robots)
+    sizes = sizes.model_copy(update={"words": len(words)})
+    checkpoint = start or Checkpoint(sizes=sizes, words=words, embodiments=robots)
     images = np.memmap(kept, np.uint8, "r", shape=(len(places), len(CAMERAS), sizes.side, sizes.side, 3))
     known = {text: checkpoint.tokens(text) for text in set(texts)}
-    widest = max(one.shape[1] for one in objects)
+    widest = max(1, *(one.shape[1] for one in objects))
     filled = [np.pad(one, ((0, 0), (0, widest - one.shape[1])), constant_values=np.nan) for one in objects]
     return checkpoint, Frames(
         images, torch.tensor(places), torch.from_numpy(np.concatenate(states)),
@@ -172,18 +180,27 @@ def loss_of(
 
 
 def fit(
-    checkpoint: Checkpoint, frames: Frames, steps: int, seed: int, kept: Path, threads: int = 1
+    checkpoint: Checkpoint,
+    frames: Frames,
+    steps: int,
+    seed: int,
+    kept: Path,
+    threads: int = 1,
+    rate: float = RATE,
+    start: Path | None = None,
 ) -> ReferenceNetwork:
-    """Return the network after so many steps, from the state in the file `kept` if there is one.
+    """Return the network after so many steps, from the state in the file `kept` if there is one, else from `start`.
 
     Each thread has a part of a batch, which is 1.4 times as fast as operations of several threads.
     """
     torch.manual_seed(seed)
     training = Training(checkpoint.sizes, frames.objects.shape[1])
+    if start is not None:
+        training.network.load_state_dict(read_network(checkpoint.sizes, start).state_dict())
     average = copy.deepcopy(training)
     own, mean = list(training.parameters()), list(average.parameters())
     copies = [copy.deepcopy(training).bfloat16() for _ in range(threads)]
-    optimizer = torch.optim.AdamW(own, lr=RATE, weight_decay=DECAY, betas=(0.9, 0.99), fused=True)
+    optimizer = torch.optim.AdamW(own, lr=rate, weight_decay=DECAY, betas=(0.9, 0.99), fused=True)
     first = 0
     if kept.is_file():
         state = torch.load(kept, weights_only=True)
@@ -208,7 +225,7 @@ def fit(
         if step < first:
             continue
         for group in optimizer.param_groups:
-            group["lr"] = RATE * min(1.0, (step + 1) / WARM_UP) * 0.5 * (1 + math.cos(math.pi * step / steps))
+            group["lr"] = rate * min(1.0, (step + 1) / WARM_UP) * 0.5 * (1 + math.cos(math.pi * step / steps))
         parts = [(step, number, part) for number, part in enumerate(np.array_split(batch, threads))]
         found = list(pool.map(gradients, parts))
         for number, value in enumerate(own):
@@ -248,6 +265,10 @@ def main(
     seed: Annotated[int, typer.Option(min=0)] = 0,
     every: Annotated[int, typer.Option(min=1, help="Of so many frames of an episode, one is trained with.")] = 1,
     threads: Annotated[int, typer.Option(min=1, help="Others round differently.")] = 2,
+    start: Annotated[
+        Path | None, typer.Option(help="Checkpoint that is trained further, instead of from nothing.")
+    ] = None,
+    rate: Annotated[float, typer.Option(help="Largest learning rate.")] = RATE,
     work: Annotated[Path, typer.Option(help="Folder for decoded images and the state of the training.")] = Path(
         "runs/reference/train"
     ),
@@ -257,11 +278,12 @@ def main(
     work.mkdir(parents=True, exist_ok=True)
     named = {robot: dict(zip(CAMERAS, names.split(","), strict=True)) for robot, _, names in
              (one.partition("=") for one in cameras)}  # fmt: skip
-    checkpoint, frames = read(data, named, work / "images.bin", every)
+    begun = None if start is None else read_checkpoint(start)
+    checkpoint, frames = read(data, named, work / "images.bin", every, begun)
     typer.echo(
         f"{len(frames.place)} of {len(frames.state)} frames of {len(named)} robots, {len(checkpoint.words)} words"
     )
-    network = fit(checkpoint, frames, steps, seed, work / "state.pt", threads)
+    network = fit(checkpoint, frames, steps, seed, work / "state.pt", threads, rate, start)
     infos = {robot: RecordedDataset(data / robot).info for robot in named}
     code = code_in(Path(__file__).parent)
     trained = {

@@ -114,7 +114,7 @@ class Agent:
     trainable: ClassVar[str | None] = None
     """Optional: the name of the attribute that a learner trains, so that new weights can be pushed into a server.
 
-    It holds a torch module, or nested dicts and lists of numpy or JAX arrays, and is shared by all sessions. "a.b" is
+    It holds a torch module, or nested dicts and lists of arrays and modules, and is shared by all sessions. "a.b" is
     the attribute b of the attribute a, which is then shared as a whole.
     """
 

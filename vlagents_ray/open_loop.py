@@ -27,7 +27,7 @@ from vlagents_ray.naming import did_you_mean
 from vlagents_ray.protocol.messages import DEFAULT_LIMITS, Budget
 from vlagents_ray.protocol.values import from_text
 from vlagents_ray.registry import require
-from vlagents_ray.robot.episode import ACTION, ENVIRONMENT, IMAGES, STATE
+from vlagents_ray.robot.episode import ACTION, ENVIRONMENT, IMAGES, INTERVENTION_COLUMN, STATE
 from vlagents_ray.serve.config.deployment import ServerArgs
 from vlagents_ray.serve.launch.deployment_file import own_settings, policy_application
 from vlagents_ray.serve.local_agent import LocalPolicy
@@ -53,6 +53,7 @@ class RecordedStep:
     frame: int
     obs: Obs
     expected: np.ndarray  # (H, D): the recorded answer, or the actions from here to the end of the episode
+    intervention: bool = False  # whether an operator moved the robot
 
 
 @dataclass(frozen=True, slots=True)
@@ -130,7 +131,7 @@ class RecordedDataset:
         pictures = [name for name, one in self.features.items() if one["dtype"] in _PICTURES]
         images = [name for name in pictures if self.features[name]["dtype"] == "image"]
         traced = [CHUNK, ROWS, "request", "captured_at"] if self.traced else []
-        numbers = [name for name in (ACTION, STATE, ENVIRONMENT) if name in self.features]
+        numbers = [name for name in (ACTION, STATE, ENVIRONMENT, INTERVENTION_COLUMN) if name in self.features]
         rows = self._rows(part, [*numbers, *images, *traced])
         actions = np.array(rows[ACTION], np.float32).reshape(part.length, -1)
         cameras = self._cameras(pictures, names)
@@ -159,7 +160,8 @@ class RecordedDataset:
             if traced:
                 info = {CAPTURED: rows["captured_at"][i], **_values(rows["request"][i])}
                 expected = np.array(rows[CHUNK][i], np.float32).reshape(-1, actions.shape[1])[: rows[ROWS][i]]
-            yield RecordedStep(i, Obs(shown, gripper, state, info), expected)
+            led = INTERVENTION_COLUMN in rows and bool(rows[INTERVENTION_COLUMN][i])
+            yield RecordedStep(i, Obs(shown, gripper, state, info), expected, led)
 
     def _parts(self) -> list[RecordedEpisode]:
         if self.version.startswith("v2."):

@@ -121,7 +121,7 @@ POLICIES: dict[str, Adapter] = {
     ),
     "upstream": Adapter(
         "vlagents_ray.policies.upstream:Upstream",
-        "any model behind a server of openpi, RoboArena, GR00T, OpenVLA, vla-eval or vlagents",
+        "any model behind openpi, RoboArena, GR00T, OpenVLA, vla-eval, vlagents, SGLang, vLLM-Omni or FlashRT",
         wants="that server",
     ),
     "noop": Adapter("vlagents_ray.policies.noop:Noop"),
@@ -272,6 +272,7 @@ _EXTRAS: dict[str, tuple[str, ...]] = {
     "record": ("av", "pyarrow"),
     "spacemouse": ("pyspacemouse",),
     "otel": ("opentelemetry",),
+    "torchrl": ("torchrl", "tensordict"),
     **{name: (name,) for name in ("wandb", "trackio", "tensorboard", "rerun")},
 }
 

@@ -21,6 +21,7 @@ from benchmarks import (
     scaling,
     success,
     throughput,
+    torchrl,
 )
 from benchmarks.checkpoints import __main__ as checkpoints
 
@@ -52,6 +53,7 @@ from benchmarks.checkpoints import __main__ as checkpoints
         (throughput, ["--clients", "few"], "few"),
         (throughput, ["--set", "base_ms=1"], "--policy"),
         (throughput, ["--peers", "openpi", "--policy", "scripted"], "noop"),
+        (torchrl, ["--source", "nowhere"], "want a checkout of TorchRL"),
     ],
 )
 def test_mistakes_are_reported_in_a_line(module: ModuleType, words: list[str], text: str) -> None:

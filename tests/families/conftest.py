@@ -16,6 +16,7 @@ from vlagents_ray.registry import ENVS, POLICIES
 _NEEDS = {name: one.needs[bool(one.checkouts) :] for name, one in (POLICIES | ENVS).items()} | {
     "arro": ("transformers", "torch"),
     "ros": ("rclpy",),
+    "torchrl": ("torchrl",),
 }
 
 _FOLDERS = {test.parent.name for test in Path(__file__).parent.glob("*/test_*.py")}

@@ -163,6 +163,9 @@ def test_episodes_have_a_label_and_discarded_ones_are_dropped(tmp_path: Path) ->
             recorder.label("good")  # type: ignore[arg-type]
     about = [pq.read_table(path).to_pylist()[0] for path in sorted(tmp_path.glob("meta/episodes/*/*.parquet"))]
     assert [one["label"] for one in about] == ["success", "failure", "none"]
+    outcomes = [[rows(tmp_path, episode)[f"next.{name}"] for name in ("reward", "success")] for episode in range(3)]
+    assert outcomes == [[[0, 1], [False, True]], *[[[0, 0], [False, False]]] * 2]
+    assert all(rows(tmp_path, episode)["next.done"] == [False, True] for episode in range(3))
     assert json.loads((tmp_path / "meta/info.json").read_text())["total_episodes"] == 3
 
 

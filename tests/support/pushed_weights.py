@@ -12,24 +12,29 @@ from vlagents_ray.interface import Agent
 from vlagents_ray.serve.weights import ModelWeights, PushOptions
 from vlagents_ray.weights.trainable import own_copy
 
+_FACTOR = 0.8  # of all numbers of a network, whose actions then differ, and remain finite
 
-def check_pushed_weights(agent: Agent, act: Callable[[], np.ndarray]) -> None:
+
+def check_pushed_weights(agent: Agent, act: Callable[[], np.ndarray], part: str = "") -> None:
     """Push weights twice.
 
     Args:
         agent: Initialized.
         act: Returns the first action of an episode, always of the same one.
+        part: In the names of the values that are pushed; all are if it is empty.
     """
     weights = ModelWeights(agent, threading.Lock())
-    before, loaded = act(), {name: own_copy(value) for name, value in agent.parameters().items()}
+    before = act()
+    loaded = {name: own_copy(value) for name, value in agent.parameters().items() if part in name}
+    options = PushOptions("keep", partial=bool(part))
 
     def push(number: int, named: Mapping[str, Any]) -> np.ndarray:
-        weights.stage(number, named, PushOptions("keep"))
-        weights.commit(number, PushOptions("keep"), list)
+        weights.stage(number, named, options)
+        weights.commit(number, options, list)
         weights.use(weights.newest)
         return act()
 
-    other = push(1, {name: 0.8 * value if value.is_floating_point() else value for name, value in loaded.items()})
+    other = push(1, {name: value * _FACTOR if "float" in str(value.dtype) else value for name, value in loaded.items()})
     assert other.shape == before.shape
     assert not np.allclose(other, before)
     np.testing.assert_array_equal(push(2, loaded), before)

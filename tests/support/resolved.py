@@ -26,8 +26,8 @@ PAGE = ROOT / "docs" / "install.md"
 LOCKS = ROOT / "cluster" / "docker" / "locks"
 TORCH = ROOT / "cluster" / "docker" / "torch.txt"
 FAMILIES = ROOT / "requirements"
-# A robot has its own ROS; RoboCasa wants 10 GB besides its packages, CALVIN a checkout.
-WITHOUT_IMAGE = {"testing", "ros", "robocasa", "calvin"}
+# A robot has its own ROS; RoboCasa wants 10 GB besides its packages, CALVIN a checkout; TorchRL learns beside a server.
+WITHOUT_IMAGE = {"testing", "ros", "robocasa", "calvin", "torchrl"}
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
 EXTRAS: dict[str, list[str]] = PROJECT["optional-dependencies"]
 OF_DEVELOPMENT = {"check", "docs", "dev"}  # these are for Python 3.11 alone

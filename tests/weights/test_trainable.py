@@ -17,6 +17,7 @@ from vlagents_ray.weights.trainable import (
     completed,
     converted,
     dtype_name,
+    evaluation_mode,
     fingerprint,
     named_values,
     portable,
@@ -177,6 +178,14 @@ def test_what_does_not_fit_is_refused(pushed: dict[str, Any], says: str) -> None
     assert "nothing was changed" in str(refused.value)
 
 
+def test_infinite_values_fit_where_the_policy_has_them() -> None:
+    mask = np.triu(np.full((2, 2), -np.inf, np.float32), 1)  # of causal attention
+    assert fitted(HELD | {"mask": mask}, NEW | {"mask": mask.copy()})["mask"].tolist() == mask.tolist()
+    for wrong in (mask.T, -mask, np.full_like(mask, np.nan)):
+        with pytest.raises(InvalidWeights, match="'mask': got NaN or infinite"):
+            fitted(HELD | {"mask": mask}, NEW | {"mask": wrong})
+
+
 def test_what_fits_is_converted() -> None:
     new = fitted(HELD, NEW | {"b": np.ones(3, np.float64)})
     assert list(new) == list(HELD)
@@ -225,3 +234,19 @@ def test_tensors_are_checked_as_arrays_are() -> None:
     with pytest.raises(UnchangedWeights):
         fitted(held, held)
     assert fingerprint(held) != fingerprint(held | {"w": held["w"] + 1})
+
+
+@pytest.mark.torch
+def test_a_tree_may_have_modules() -> None:
+    torch = pytest.importorskip("torch")
+    network, head = torch.nn.Linear(2, 1).train(), {"scale": torch.ones(1)}
+    tree = {"network": network, "head": head}
+    assert list(named_values(tree)) == ["network/weight", "network/bias", "head/scale"]
+    weight = network.weight
+    set_values(tree, {"network/weight": torch.full((1, 2), 3.0), "head/scale": torch.full((1,), 4.0)})
+    assert network.weight is weight
+    assert weight.tolist() == [[3, 3]]
+    assert head["scale"].tolist() == [4]
+    with evaluation_mode(tree):
+        assert not network.training
+    assert network.training

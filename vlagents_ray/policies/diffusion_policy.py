@@ -70,6 +70,7 @@ class DiffusionPolicy(ModelPolicy):
 
     Config: ClassVar[type] = DiffusionPolicyConfig
     config: DiffusionPolicyConfig
+    trainable = "model.module"
 
     @property
     def history(self) -> int:

@@ -443,6 +443,7 @@ class Gr00t(ModelPolicy):
     Config: ClassVar[type] = Gr00tConfig
     config: Gr00tConfig
     model: Gr00tNetwork | None
+    trainable = "model.model"
 
     @property
     def history(self) -> int:

@@ -81,6 +81,7 @@ class Octo(ModelPolicy):
 
     Config: ClassVar[type] = OctoConfig
     config: OctoConfig
+    trainable = "model.params"
 
     @property
     def history(self) -> int:

@@ -6,7 +6,7 @@ import abc
 import dataclasses
 import importlib
 import logging
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, ClassVar, Literal
@@ -280,6 +280,7 @@ class OpenPiModel(abc.ABC):
 
     noise_shape: tuple[int, int] | None = None  # (H, action_dim) of a row's noise; None for a model without noise
     shares = False  # whether several rows can share one observation
+    trained: Any  # what a learner trains: the torch module, or the dicts of arrays that JAX checkpoints have
 
     @abc.abstractmethod
     def sample(self, batch: SampleBatch) -> np.ndarray:
@@ -300,22 +301,22 @@ class JaxFlow(OpenPiModel):
     shares = True
 
     def __init__(self, network: Any, device: Any, config: OpenPiConfig) -> None:
-        jax, nnx, models = require("jax"), require("flax.nnx"), require("openpi.models.model")
+        jax, models = require("jax"), require("openpi.models.model")
         jnp, attention_mask = jax.numpy, require("openpi.models.pi0").make_attn_mask
-        graph, self._state = nnx.split(network)
+        self.trained, merged = _split(network)
         self._device = device
         steps, limit = config.steps or _STEPS, config.guidance
 
-        def encode(state: Any, batch: Any) -> Any:
-            model = nnx.merge(graph, state)
+        def encode(params: Any, batch: Any) -> Any:
+            model = merged(params)
             observation = models.preprocess_observation(None, _observation(batch), train=False)
             tokens, seen, causal = model.embed_prefix(observation)
             mask, places = attention_mask(seen, causal), jnp.cumsum(seen, axis=1) - 1
             _, (keys, values) = model.PaliGemma.llm([tokens, None], mask=mask, positions=places)
             return keys.swapaxes(0, 1), values.swapaxes(0, 1), seen, observation.state  # rows before layers
 
-        def follow(state: Any, encoded: Any, noise: Any, guide: Any) -> Any:
-            model, guide = nnx.merge(graph, state), Guide(*guide)
+        def follow(params: Any, encoded: Any, noise: Any, guide: Any) -> Any:
+            model, guide = merged(params), Guide(*guide)
             keys, values, seen, proprio = encoded
             cache = keys.swapaxes(0, 1), values.swapaxes(0, 1)
             observation = models.Observation(images={}, image_masks={}, state=proprio)
@@ -354,30 +355,27 @@ class JaxFlow(OpenPiModel):
             guide = Guide(np.zeros_like(batch.noise), none, none)
         given = batch.inputs, np.asarray(batch.owners), batch.noise, (guide.plan, guide.frozen, guide.weight)
         inputs, owners, noise, plan = jax.device_put(given, self._device)
-        encoded = self._encode(self._state, inputs)
+        encoded = self._encode(self.trained, inputs)
         if len(encoded[0]) < len(owners):
             encoded = self._gather(encoded, owners)
-        return np.asarray(self._follow(self._state, encoded, noise, plan), np.float32)  # waits for the device
+        return np.asarray(self._follow(self.trained, encoded, noise, plan), np.float32)  # waits for the device
 
 
 class JaxTokens(OpenPiModel):
     """π0-FAST in JAX, with greedy decoding and without noise."""
 
     def __init__(self, network: Any, device: Any, config: OpenPiConfig) -> None:
-        jax, nnx = require("jax"), require("flax.nnx")
-        graph, self._state = nnx.split(network)
-        self._device = device
-        most = config.max_decoding_steps
+        jax, self._device, most = require("jax"), device, config.max_decoding_steps
+        self.trained, merged = _split(network)
 
-        def sample(state: Any, batch: Any) -> Any:
-            model = nnx.merge(graph, state)
-            return model.sample_actions(jax.random.key(0), _observation(batch), max_decoding_steps=most)
+        def sample(params: Any, batch: Any) -> Any:
+            return merged(params).sample_actions(jax.random.key(0), _observation(batch), max_decoding_steps=most)
 
         self._sample = jax.jit(sample)
 
     def sample(self, batch: SampleBatch) -> np.ndarray:
         jax = require("jax")
-        return self.ended(np.asarray(self._sample(self._state, jax.device_put(batch.inputs, self._device)), np.int32))
+        return self.ended(np.asarray(self._sample(self.trained, jax.device_put(batch.inputs, self._device)), np.int32))
 
     @staticmethod
     def ended(tokens: np.ndarray) -> np.ndarray:
@@ -392,7 +390,7 @@ class TorchFlow(OpenPiModel):
     shares = True
 
     def __init__(self, network: Any, device: Any, config: OpenPiConfig, compilation: Compilation) -> None:
-        self._network, self._device = network, device
+        self.trained, self._device = network, device
         self._passes = Pi0Passes(network, compilation)
         self._steps, self._limit = config.steps or _STEPS, config.guidance
         self.noise_shape: tuple[int, int] = (network.config.action_horizon, network.config.action_dim)
@@ -406,7 +404,7 @@ class TorchFlow(OpenPiModel):
         if batch.random is not None:
             changes.append(batch.random.change)
         with torch.inference_mode():
-            inputs = self._network._preprocess_observation(observation, train=False)
+            inputs = self.trained._preprocess_observation(observation, train=False)
             flow = self._passes.sample(*inputs, noise=start, owners=batch.owners, steps=self._steps, changes=changes)
         return fetch(flow.float())
 
@@ -416,6 +414,14 @@ class TorchFlow(OpenPiModel):
     def _convert(self, array: np.ndarray) -> Any:
         """Return a copy of the array as a tensor on the device."""
         return require("torch").from_numpy(np.array(array)).to(self._device, non_blocking=True)
+
+
+def _split(network: Any) -> tuple[dict[str, Any], Callable[[Any], Any]]:
+    """Return the parameters of a JAX model by openpi's names, and the function that makes the model of them."""
+    jax, nnx = require("jax"), require("flax.nnx")
+    graph, state = nnx.split(network)
+    structure = jax.tree.structure(state)  # of the same leaves as the dicts, as both are sorted by their keys
+    return state.to_pure_dict(), lambda params: nnx.merge(graph, jax.tree.unflatten(structure, jax.tree.leaves(params)))
 
 
 def load_jax(config: Any, folder: Path, settings: OpenPiConfig) -> OpenPiModel:
@@ -518,6 +524,7 @@ class OpenPi(ModelPolicy):
     Config: ClassVar[type] = OpenPiConfig
     config: OpenPiConfig
     model: LoadedOpenPi | None
+    trainable = "model.model.trained"
 
     @property
     def contract(self) -> Contract:

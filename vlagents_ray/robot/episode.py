@@ -30,6 +30,8 @@ INTERVENTIONS = {  # further columns of a recording with interventions, beside `
     INTERVENTION_COLUMN: "bool",  # whether the action is an operator's
     "policy_known": "bool",  # whether the policy's action is known; if not, `WANTED_ACTION` is zeros
 }
+# LeRobot's own names for the outcome of an action; `success` is that of the state after it.
+OUTCOMES = {"next.reward": "float32", "next.success": "bool", "next.done": "bool"}
 Stats = dict[str, np.ndarray]  # "min", "max", "mean", "std", "count", "q01", ...
 Label = Literal["success", "failure", "discard"]
 INDEX = {  # columns that the dataset adds to each frame
@@ -124,13 +126,18 @@ class RobotEpisode:
         """Complete the videos, and return the episode."""
         for _, video in self.videos.values():
             video.finish()
+        rows = {
+            key: np.array(values, object) if isinstance(values[0], str) else np.stack(values)
+            for key, values in self.rows.items()
+        }
+        if self.interventions:
+            success = np.zeros(len(rows[ACTION]), bool)
+            success[-1] = label == "success"
+            rows |= outcome_rows(success, success)
         return Finished(
             self.instruction,
             self.features,
-            {
-                key: np.array(values, object) if isinstance(values[0], str) else np.stack(values)
-                for key, values in self.rows.items()
-            },
+            rows,
             {key: images.result() for key, images in self.images.items()},
             {key: path for key, (path, _) in self.videos.items()},
             self.about,
@@ -158,7 +165,7 @@ class RobotEpisode:
             features[STATE] = vector_feature(names)
         features[ACTION] = vector_feature([f"action_{i}" for i in range(action_dim)])
         if self.interventions:
-            features |= {WANTED_ACTION: features[ACTION]} | number_features(INTERVENTIONS)
+            features |= {WANTED_ACTION: features[ACTION]} | number_features(INTERVENTIONS | OUTCOMES)
         features |= number_features(MOMENTS | INDEX)
         for name, value in more.items():
             dtype = "float32" if isinstance(value, np.ndarray) else _DTYPES[type(value)]
@@ -216,6 +223,12 @@ def vector_feature(names: list[str]) -> dict[str, Any]:
 def number_features(dtypes: Mapping[str, str]) -> dict[str, Any]:
     """Describe features of one number each."""
     return {name: {"dtype": dtype, "shape": [1], "names": None} for name, dtype in dtypes.items()}
+
+
+def outcome_rows(rewards: np.ndarray, success: np.ndarray) -> dict[str, np.ndarray]:
+    """Return the columns of `OUTCOMES` of an episode, (N,) each; its last frame is done."""
+    done = np.arange(len(success)) == len(success) - 1
+    return dict(zip(OUTCOMES, (rewards.astype(np.float32), success, done), strict=True))
 
 
 def state_vector(

@@ -1,6 +1,7 @@
-"""The named values of a trainable object: a torch module, or nested dicts and lists of numpy or JAX arrays.
+"""The named values of a trainable object: a torch module, or nested dicts and lists of arrays and torch modules.
 
-The name of a value in a torch module is that in its `state_dict`; in nested dicts it is the keys, joined with "/".
+The name of a value in a torch module is that in its `state_dict`; in nested dicts it is the keys, joined with "/", and
+then that in a module.
 Torch and JAX are never imported here: their objects exist only if they have been imported.
 """
 
@@ -35,7 +36,13 @@ def named_values(trainable: Any) -> dict[str, Any]:
     if _is_module(trainable):
         # A module may add state other than tensors (`get_extra_state`), which a learner does not train.
         return {name: value for name, value in trainable.state_dict().items() if is_array(value)}
-    return {name: container[key] for name, container, key in _leaves(trainable)}
+    found = dict[str, Any]()
+    for name, container, key in _leaves(trainable):
+        if _is_module(container[key]):
+            found |= {f"{name}/{own}": value for own, value in named_values(container[key]).items()}
+        else:
+            found[name] = container[key]
+    return found
 
 
 def set_values(trainable: Any, named: Mapping[str, Any]) -> None:
@@ -46,7 +53,12 @@ def set_values(trainable: Any, named: Mapping[str, Any]) -> None:
     """
     if not _is_module(trainable):
         for name, container, key in list(_leaves(trainable)):
-            if name in named:
+            value, within = container[key], f"{name}/"
+            if _is_module(value):
+                set_values(value, {one.removeprefix(within): named[one] for one in named if one.startswith(within)})
+            elif name in named and _is_tensor(value) and _on_gpu(value):
+                _overwrite(value, named[name])
+            elif name in named:
                 container[key] = named[name]
         return
     held = {
@@ -60,13 +72,22 @@ def set_values(trainable: Any, named: Mapping[str, Any]) -> None:
             if name in held and alias.device.type == "cpu":
                 held[name].data = named[name]
             else:
-                copy(named[name], alias) if alias.is_contiguous() else alias.copy_(named[name])
+                _overwrite(alias, named[name])
+
+
+def _overwrite(held: Any, value: Any) -> None:
+    with sys.modules["torch"].no_grad():
+        copy(value, held) if held.is_contiguous() else held.copy_(value)
 
 
 @contextmanager
 def evaluation_mode(trainable: Any) -> Iterator[None]:
-    """Put a torch module into evaluation mode (no dropout, no batch statistics), and restore the mode of each part."""
-    parts = list(trainable.modules()) if _is_module(trainable) else []
+    """Put torch modules into evaluation mode (no dropout, no batch statistics), and restore the mode of each part."""
+    leaves: Iterable[tuple[str, Any, Any]] = (
+        _leaves(trainable) if isinstance(trainable, dict | list) else [("", [trainable], 0)]
+    )
+    values = [container[key] for _, container, key in leaves]
+    parts = [part for value in values if _is_module(value) for part in value.modules()]
     modes = [part.training for part in parts]
     try:
         for part in parts:
@@ -178,15 +199,15 @@ def is_array(value: Any) -> bool:
 
 
 def _leaves(tree: Any, path: str = "") -> Iterator[tuple[str, Any, Any]]:
-    """Yield name, container and key of each array."""
+    """Yield name, container and key of each array or torch module."""
     if not isinstance(tree, dict | list):
         at = f" at {path.rstrip('/')!r}" if path else ""
         raise NotTrainable(
-            f"trainable{at}: got {type(tree).__name__}, want a torch module, or dicts and lists of arrays; "
-            f"or define parameters() and load_parameters()"
+            f"trainable{at}: got {type(tree).__name__}, want a torch module, or dicts and lists of arrays "
+            f"and modules; or define parameters() and load_parameters()"
         )
     for key, value in tree.items() if isinstance(tree, dict) else enumerate(tree):
-        if is_array(value):
+        if is_array(value) or _is_module(value):
             yield f"{path}{key}", tree, key
         else:
             yield from _leaves(value, f"{path}{key}/")
@@ -327,7 +348,9 @@ def copy(source: Any, target: Any) -> Any:
 
 
 def accepted(held: Mapping[str, Any], pushed: Mapping[str, Any], *, partial: bool = False) -> dict[str, Any]:
-    """Return pushed values with the types and devices of those held, of which only these and the shapes are read.
+    """Return pushed values with the types and devices of those held.
+
+    Of those held, only these and the shapes are read, except where pushed ones are not finite.
 
     Names whose values are tied in `held` get the same value, the last one that was pushed.
 
@@ -337,7 +360,8 @@ def accepted(held: Mapping[str, Any], pushed: Mapping[str, Any], *, partial: boo
         partial: Whether names may be missing, as in a push of adapters alone.
 
     Raises:
-        InvalidWeights: A name is unknown or missing, or a value has another shape or kind of type, or is not finite.
+        InvalidWeights: A name is unknown or missing, or a value has another shape or kind of type, or is neither
+            finite nor equal to the one held.
     """
     require_fit(held, pushed, partial=partial)
     places = {name: memory_of(name, value) for name, value in held.items()}
@@ -345,7 +369,9 @@ def accepted(held: Mapping[str, Any], pushed: Mapping[str, Any], *, partial: boo
     new = {place: converted(pushed[name], held[name]) for place, name in last.items()}
     finite = {name: _is_finite(new[place]) for place, name in last.items()}
     finite |= _fetched({name: one for name, one in finite.items() if _is_tensor(one)})
-    _refuse([f"{name!r}: got NaN or infinite values, want finite ones" for name, is_so in finite.items() if not is_so])
+    # Constants of a module, such as masks of attention, may be infinite: a learner pushes them unchanged.
+    wrong = [name for name, is_so in finite.items() if not is_so and not _is_equal(new[places[name]], held[name])]
+    _refuse([f"{name!r}: got NaN or infinite values, want finite ones" for name in wrong])
     return {name: new[place] for name, place in places.items() if place in new}
 
 

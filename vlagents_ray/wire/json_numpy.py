@@ -40,6 +40,21 @@ def dumps(value: Any) -> str:
     return json.dumps(value, default=_plain)
 
 
+def rows(value: list[Any]) -> np.ndarray:
+    """Return the array of a list of numbers, lists or arrays; raise `MalformedMessage` if they make none."""
+    if value and all(isinstance(row, np.ndarray) for row in value):
+        if len(shapes := {row.shape for row in value}) != 1:
+            raise MalformedMessage(f"action: got rows of the shapes {sorted(shapes)[:8]}, want the same in all")
+        return np.stack(value)
+    try:
+        array = np.asarray(value)
+    except ValueError as error:
+        raise MalformedMessage(f"action: no array of numbers ({error})") from error
+    if array.dtype.kind not in "fiu":
+        raise MalformedMessage(f"action: got {array.dtype}, want numbers")
+    return array
+
+
 def decode_base64(data: object, what: str) -> bytes:
     """Decode base64 in the standard or the URL-safe alphabet; `what` is the name of the data in errors."""
     if not isinstance(data, str):

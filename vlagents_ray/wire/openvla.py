@@ -50,18 +50,8 @@ def decode_action(body: bytes, limits: Limits = DEFAULT_LIMITS) -> np.ndarray | 
         value = json_numpy.loads(value, limits)
     if isinstance(value, str):
         return None
-    if isinstance(value, list) and value and all(isinstance(row, np.ndarray) for row in value):
-        if len(shapes := {row.shape for row in value}) != 1:
-            raise MalformedMessage(f"action: got rows of the shapes {sorted(shapes)[:8]}, want the same in all")
-        value = np.stack(value)
-    elif isinstance(value, list):
-        try:
-            array = np.asarray(value)
-        except ValueError as error:
-            raise MalformedMessage(f"action: no array of numbers ({error})") from error
-        if array.dtype.kind not in "fiu":
-            raise MalformedMessage(f"action: got {array.dtype}, want numbers")
-        value = array
+    if isinstance(value, list):
+        value = json_numpy.rows(value)
     if not isinstance(value, np.ndarray):
         raise MalformedMessage(f"action: got {type(value).__name__}, want an array, or a list of rows")
     return value

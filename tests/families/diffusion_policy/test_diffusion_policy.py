@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 from counting_compiler import CountingCompiler, counting_compiler
+from pushed_weights import check_pushed_weights
 
 from tests.families.diffusion_policy.conftest import LIBRARIES, Checkpoint, begun, loaded, made, seen
 from vlagents_ray import Obs
@@ -108,6 +109,13 @@ def test_the_state_may_be_of_several_parts(checkpoint: Checkpoint) -> None:
     np.testing.assert_array_equal(policy.perceive(obs)["obs"], [1, 2, 3, 0.25])
     contract = policy.contract
     assert (contract.state, contract.gripper, contract.chunk) == ({"joints": StateSpec()}, True, 2)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_it_acts_with_pushed_weights(kind: str, checkpoint: Checkpoint) -> None:
+    policy = loaded(checkpoint(kind))  # of this test alone
+    assert policy.parameters().keys() == policy.model.module.state_dict().keys()  # those of the authors' training
+    check_pushed_weights(policy, lambda: begun(policy).act(seen(0)).action)
 
 
 @pytest.mark.verifies("isolation")

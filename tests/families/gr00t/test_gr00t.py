@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from pushed_weights import check_pushed_weights
 from safetensors.torch import load_file
 
 from tests.families.gr00t import tiny
@@ -143,6 +144,12 @@ def test_in_bfloat16_its_actions_are_those_of_their_class_as_it_is(
     np.testing.assert_allclose(ours, wanted, atol=0.05)  # of 2, the width of an action's range; its steps are of 2**-8
     other = begun(policy, 3).act(view(3)).action
     assert np.abs(other - wanted).max() > 0.3
+
+
+def test_it_acts_with_pushed_weights(policy_of: Policy) -> None:
+    policy = policy_of("relative", seed=1)  # of this test alone
+    assert policy.parameters().keys() == policy.model.model.state_dict().keys()  # those of NVIDIA's trainer
+    check_pushed_weights(policy, lambda: begun(policy).act(view(0)).action)
 
 
 @pytest.mark.verifies("batches")

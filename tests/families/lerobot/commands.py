@@ -32,6 +32,7 @@ BUILD = "import sys; from setuptools import build_meta; build_meta.build_wheel(s
 class Server:
     url: str
     key: str
+    engine: Engine
 
     def options(self, folder: Path) -> list[str]:
         """The options of a command whose policy is here, with the key in a file in `folder`."""
@@ -55,7 +56,7 @@ def serving(policy: Agent) -> Iterator[Server]:
         return metadata | {"continues_plans": engine.models.continues_plans}
 
     with served(AccessMiddleware(build_http_app(engine, describe, DEFAULT_LIMITS), known.keys, "app")) as port:
-        yield Server(f"http://127.0.0.1:{port}", key)
+        yield Server(f"http://127.0.0.1:{port}", key, engine)
     engine.close()
 
 

@@ -24,8 +24,10 @@ torch.set_num_threads(1)  # the models are too small for more: threads would wai
 PATCHED = tiny.NEW or importlib.util.find_spec("transformers.models.siglip.check") is not None
 LEFT_OUT: dict[str, str] = {}  # why a file is not run here, for the family's page
 if tiny.NEW:
-    of_both = ("test_adapters.py", "test_learning.py", "test_pi_recipe.py", "test_plugins.py", "test_recipe.py")
-    LEFT_OUT |= dict.fromkeys(of_both, "the code is that of the other version, with which it is tried")
+    of_both = ("adapters", "hilserl", "learning", "pi_recipe", "plugins", "recipe")
+    LEFT_OUT |= dict.fromkeys(
+        (f"test_{name}.py" for name in of_both), "the code is that of the other version, with which it is tried"
+    )
 else:
     LEFT_OUT |= {"test_rollout.py": "LeRobot 0.4 has no lerobot-rollout"}
 if not PATCHED:
@@ -37,6 +39,7 @@ if importlib.util.find_spec("ray") is None:
         "test_async_client.py",
         "test_commands.py",
         "test_datasets.py",
+        "test_hilserl.py",
         "test_training.py",
     )
     LEFT_OUT |= dict.fromkeys(of_ray, "no Ray here, as its Python is another")

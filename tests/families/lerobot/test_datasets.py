@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -10,6 +11,7 @@ from eval_fakes import LINE
 from in_process_evaluation import flat_config, play
 from lerobot.datasets.dataset_tools import delete_episodes, merge_datasets
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
+from lerobot.rl.buffer import ReplayBuffer
 from recorded_sessions import recorded, seen
 
 from vlagents_ray.dataset_contract import BYTES, STATISTICS, DatasetContract
@@ -101,5 +103,11 @@ def test_lerobot_reads_what_a_human_corrected(tmp_path: Path) -> None:
     assert [frame["action"].tolist() for frame in frames] == [[i, i] for i in range(6)]
     assert list(dataset.meta.episodes["label"]) == ["success", "failure"]
     assert dataset.meta.stats["policy_action"]["count"] == [12]
+    plain: dict[str, Any] = {"device": "cpu", "use_drq": False, "image_augmentation_function": lambda images: images}
+    buffer = ReplayBuffer.from_lerobot_dataset(dataset, state_keys=["observation.state"], **plain)
+    assert buffer.rewards.tolist() == [0, 0, 0, 0, 0, 1, *[0] * 6], "of HIL-SERL: the label is the reward"
+    assert buffer.dones.tolist() == [False] * 5 + [True] + [False] * 5 + [True]
+    assert buffer.actions.tolist() == [[i, i] for i in range(6)] * 2, "those that were executed"
+    assert buffer.next_states["observation.state"][:, 0].tolist() == [1, 2, 3, 4, 5, 5] * 2
     kept = delete_episodes(dataset, [1], tmp_path / "kept", "corrections/kept")
     assert [bool(kept[i]["intervention"]) for i in range(6)] == [False] * 3 + [True] * 3

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 from jax_compiles import jax_compiles
+from pushed_weights import check_pushed_weights
 
 from tests.families.octo.conftest import MARKS
 from vlagents_ray import Act, Obs
@@ -173,3 +174,13 @@ def test_no_act_compiles_a_program(pretrained: Path) -> None:
             acts = policy.act_batch(views, [begun(policy, view, seed=i) for i, view in enumerate(views)])
             assert all(isinstance(act, Act) for act in acts)
     assert compiled == []
+
+
+def test_it_acts_with_pushed_weights(pretrained: Path) -> None:
+    from flax.traverse_util import flatten_dict
+
+    policy = made(pretrained, batch_sizes=[1])
+    policy.initialize()
+    assert policy.parameters().keys() == flatten_dict(policy.model.model.params, sep="/").keys()  # those of OctoModel
+    obs = seen(1)
+    check_pushed_weights(policy, lambda: begun(policy, obs).act(obs).action)

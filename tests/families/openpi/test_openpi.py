@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 from jax_compiles import jax_compiles
+from pushed_weights import check_pushed_weights
 
 from tests.families.openpi.conftest import MARKS
 from vlagents_ray import Act, Obs
@@ -23,6 +24,7 @@ pytestmark = MARKS
 WORDS = ("pick up the cube", "push", "open the upper drawer")
 BATCHED = 1e-5  # how far a batch's actions may be off those of a lone row, in float32 on a CPU
 KINDS = ("pi0", "pi05", "aloha")
+PROGRAMS = {"pi0": ("_encode", "_follow"), "fast": ("_sample",)}
 # openpi's observation -> ours, as a client of each would send it
 MAPPINGS = {"pi0": "openpi-libero", "pi05": "openpi-droid", "aloha": "openpi-aloha", "fast": "openpi-droid"}
 
@@ -225,6 +227,24 @@ def test_what_a_row_says_after_its_end_is_dropped() -> None:
 
     tokens = np.array([[5, 1, 7, 1], [5, 6, 7, 8]])
     np.testing.assert_array_equal(JaxTokens.ended(tokens), [[5, 1, 0, 0], [5, 6, 7, 8]])
+
+
+@pytest.mark.parametrize("kind", ["pi0", "fast"])
+def test_it_acts_with_pushed_weights(kind: str, loaded: Any, checkpoint: Any) -> None:
+    from flax.traverse_util import flatten_dict
+    from openpi.models.model import restore_params
+
+    policy = loaded(kind)
+    assert policy.parameters().keys() == flatten_dict(restore_params(checkpoint(kind) / "params"), sep="/").keys()
+    programs = [getattr(policy.model.model, name) for name in PROGRAMS[kind]]
+    compiled = [one._cache_size() for one in programs]
+    check_pushed_weights(policy, lambda: begun(policy, kind, 0).act(seen(kind, 0)).action)
+    assert [one._cache_size() for one in programs] == compiled
+
+
+def test_a_learner_of_adapters_pushes_these_alone(loaded: Any) -> None:
+    policy = loaded("lora")
+    check_pushed_weights(policy, lambda: begun(policy, "pi0", 0).act(seen("pi0", 0)).action, part="lora")
 
 
 def test_a_compiled_loop_has_no_random_steps(loaded: Any) -> None:

@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 from counting_compiler import counting_compiler
 from normal_steps import logprob_of_steps
+from pushed_weights import check_pushed_weights
 
 from tests.families.openpi.conftest import MARKS
 from tests.families.openpi.test_openpi import BATCHED, WORDS, begun, seen, theirs
@@ -49,7 +50,7 @@ def test_actions_are_those_of_openpis_own_policy_alone_and_in_company(port: Path
     policy = made(port)
     transforms = policy.model.transforms
     upstream = Policy(
-        policy.model.model._network,
+        policy.model.model.trained,
         transforms=transforms.inputs.transforms,
         output_transforms=transforms.outputs.transforms,
         sample_kwargs={"num_steps": 3},
@@ -79,6 +80,13 @@ def test_compiled_passes_act_as_without(port: Path) -> None:
 
 
 @patched
+def test_it_acts_with_pushed_weights(port: Path) -> None:
+    policy = made(port)
+    assert policy.parameters().keys() == policy.model.model.trained.state_dict().keys()  # those of openpi's trainer
+    check_pushed_weights(policy, lambda: begun(policy, "pi0", 0).act(seen("pi0", 0)).action)
+
+
+@patched
 def test_frozen_rows_come_back_as_planned(port: Path) -> None:
     policy = made(port)
     plan = begun(policy, "pi0", 1).act(seen("pi0", 1)).action[1:]
@@ -100,7 +108,7 @@ def test_the_log_probability_is_that_of_the_network_itself(port: Path, monkeypat
     policy = made(port, noise_level=LEVEL)
     assert policy.contract.behaviour == tuple(ALL)
     act = begun(policy, "pi0", 0).act(seen("pi0", 0, **{WANT: ALL, SAMPLES: 2}))
-    network, seen_velocities = policy.model.model._network, []
+    network, seen_velocities = policy.model.model.trained, []
     session = begun(policy, "pi0", 0)
     inputs = session.perceive(seen("pi0", 0)).inputs
     observation = _observation({key: _tensors(value) for key, value in inputs.items()})
@@ -133,7 +141,7 @@ def _tensors(value: Any) -> Any:
 @patched
 def test_the_samples_of_an_observation_are_of_one_reading_of_it(port: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     policy, read = made(port, noise_level=LEVEL), []
-    network = policy.model.model._network
+    network = policy.model.model.trained
     embed = network.embed_prefix
 
     def counted(images: Any, *rest: Any) -> Any:

@@ -1,6 +1,6 @@
 """Small random checkpoints of openpi, made with its own code: weights, statistics, tokenizer.
 
-    OPENPI_SRC=… python tests/families/openpi/tiny.py OUT_FOLDER [pi0|pi05|aloha|fast]
+    OPENPI_SRC=… python tests/families/openpi/tiny.py OUT_FOLDER [pi0|pi05|aloha|fast|lora]
 
 Serve one with `config: tests.families.openpi.tiny:PI0` and OPENPI_DATA_HOME=OUT_FOLDER/cache, where openpi finds the
 tokenizer that it would download. Importing this module makes openpi's vision tower and vocabulary small.
@@ -24,7 +24,7 @@ import orbax.checkpoint  # noqa: E402
 import sentencepiece  # noqa: E402
 from flax import nnx  # noqa: E402
 from openpi import transforms  # noqa: E402
-from openpi.models import gemma, gemma_fast, pi0_config, pi0_fast, siglip, tokenizer  # noqa: E402
+from openpi.models import gemma, gemma_fast, lora, pi0_config, pi0_fast, siglip, tokenizer  # noqa: E402
 from openpi.policies import droid_policy  # noqa: E402
 from openpi.shared import normalize  # noqa: E402
 from openpi.training import config as training  # noqa: E402
@@ -45,6 +45,16 @@ def _small_config(variant: str) -> Any:
 
 
 gemma_fast.get_config = _small_config
+_any_config = gemma.get_config
+
+
+def _adapted_config(variant: str) -> Any:
+    config = _any_config(variant.removesuffix("_lora"))
+    adapters = dict.fromkeys(("attn", "ffn"), lora.LoRAConfig(rank=4, alpha=4.0)) if variant.endswith("_lora") else {}
+    return dataclasses.replace(config, lora_configs=adapters)
+
+
+gemma.get_config = _adapted_config
 
 
 class Words(tokenizer.FASTTokenizer):
@@ -86,8 +96,11 @@ FAST = training.TrainConfig(
     model=pi0_fast.Pi0FASTConfig(action_dim=8, action_horizon=4, max_token_len=100, fast_model_tokenizer=Words),
     data=training.SimpleDataConfig(assets=training.AssetsConfig(asset_id="droid"), data_transforms=_droid),
 )
-CONFIGS = {"pi0": PI0, "pi05": PI05, "aloha": ALOHA, "fast": FAST}
-_DIMS = {"pi0": (8, 7), "pi05": (8, 8), "aloha": (14, 14), "fast": (8, 8)}  # of states and actions
+LORA = dataclasses.replace(  # as pi0_libero_low_mem_finetune
+    PI0, name="tiny_pi0_lora", model=dataclasses.replace(PI0.model, **dict.fromkeys(_SMALL, "dummy_lora"))
+)
+CONFIGS = {"pi0": PI0, "pi05": PI05, "aloha": ALOHA, "fast": FAST, "lora": LORA}
+_DIMS = {"pi0": (8, 7), "pi05": (8, 8), "aloha": (14, 14), "fast": (8, 8), "lora": (8, 7)}  # of states and actions
 
 
 def save(folder: str | Path, kind: str = "pi0", seed: int = 0) -> Path:

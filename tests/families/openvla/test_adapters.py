@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import shutil
+import threading
 import warnings
 from collections.abc import Callable
 from pathlib import Path
@@ -12,7 +13,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from peft import LoraConfig, get_peft_model
+from peft import LoraConfig, PeftModel, get_peft_model
 
 from tests.families.openvla.conftest import LIBRARIES, WORDS, seen
 from tests.families.openvla.upstream import module
@@ -20,6 +21,7 @@ from vlagents_ray.errors import ConfigError
 from vlagents_ray.interface import DISTRIBUTION, POLICY, SAMPLES, Act
 from vlagents_ray.policies.openvla.policy import OpenVLA
 from vlagents_ray.serve.models.agent_copies import AgentCopies
+from vlagents_ray.serve.weights import ModelWeights, PushOptions
 
 pytestmark = [pytest.mark.source("OPENVLA_SRC"), *LIBRARIES]
 
@@ -91,6 +93,26 @@ def test_each_row_of_one_pass_acts_as_its_adapter_merged_alone(
         assert (POLICY in act.info) == (name is not None)
         if name is not None:
             assert not np.array_equal(wanted.action, session(alone[None], seed).act(seen(seed)).action)
+
+
+def test_a_learner_pushes_the_layers_alone_that_its_adapters_change(
+    checkpoint: Callable[[str], Path], saved: dict[str, Path]
+) -> None:
+    policy, cls = load(checkpoint("openvla")), module("OPENVLA_SRC", "extern.hf.modeling_prismatic")
+    trained = PeftModel.from_pretrained(
+        cls.OpenVLAForActionPrediction.from_pretrained(checkpoint("openvla")), saved["first"]
+    )
+    trained.merge_adapter()
+    merged = {name: value for name, value in trained.state_dict().items() if name.endswith(".base_layer.weight")}
+    pushed = {name.removeprefix("base_model.model.").replace(".base_layer", ""): merged[name] for name in merged}
+    weights, options = ModelWeights(policy, threading.Lock()), PushOptions(partial=True)
+    weights.stage(1, pushed, options)
+    weights.commit(1, options, list)
+    weights.use(weights.newest)
+    acts = [session(one, 1).act(seen(1, **{SAMPLES: 2})) for one in (policy, load(saved["merged/first"]))]
+    assert np.array_equal(*(act.action for act in acts))
+    np.testing.assert_allclose(*(act.info[DISTRIBUTION]["mean"] for act in acts), atol=ATOL)
+    assert len(pushed) < len(policy.parameters())
 
 
 def test_statistics_of_another_action_are_refused(checkpoint: Callable[[str], Path], saved: dict[str, Path]) -> None:

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 import torch
 from PIL import Image
+from pushed_weights import check_pushed_weights
 from transformers import AutoTokenizer
 
 from tests.families.openvla import tiny
@@ -175,6 +176,21 @@ def test_everything_that_is_seen_counts(loaded: Callable[..., Any], part: str, k
     else:
         obs.cameras[part] = 255 - obs.cameras[part]
     assert np.abs(before.act(obs).action - begun(policy, 0).act(seen(0)).action).max() > 0.01
+
+
+@pytest.mark.parametrize(
+    ("kind", "parts"),
+    [
+        ("oft", {"action_head", "proprio_projector"}),
+        ("oft-diffusion", {"action_head", "proprio_projector", "noisy_action_projector"}),
+        ("oft-film", {"action_head", "proprio_projector", "film"}),
+        ("oft-tokens", {"proprio_projector"}),
+    ],
+)
+def test_it_acts_with_pushed_weights(loaded: Callable[..., Any], kind: str, parts: set[str]) -> None:
+    policy = loaded(kind, seed=1, **SETTINGS[kind])  # of this test alone
+    assert {name.partition("/")[0] for name in policy.parameters()} == {"vla", *parts}
+    check_pushed_weights(policy, lambda: begun(policy, 0).act(seen(0)).action)
 
 
 @pytest.mark.parametrize("kind", ["oft-tokens", "oft-diffusion"], indirect=True)

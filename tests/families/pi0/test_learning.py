@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -10,17 +11,24 @@ import numpy as np
 import pytest
 import torch
 from counting_compiler import counting_compiler
+from in_flight import answered
 from normal_steps import logprob_of_steps
 from pushed_weights import check_pushed_weights
 from shared_readings import check_shared_readings
 
 from tests.families.pi0 import tiny
-from tests.families.pi0.conftest import BATCHED, begun, made, seen
+from tests.families.pi0.conftest import BATCHED, WORDS, begun, made, seen
 from vlagents_ray.interface import BEHAVIOUR, DELAY, DISTRIBUTION, LEFTOVER, SAMPLES, WANT, Act, Obs
+from vlagents_ray.learn import Publisher
 from vlagents_ray.policies import pi0
 from vlagents_ray.policies.flow import logprob_of_chain
 from vlagents_ray.policies.pi0 import Pi0
+from vlagents_ray.protocol.messages import Request
+from vlagents_ray.serve.engine.engine import Engine
+from vlagents_ray.serve.python_env.child_agent import Child, ChildAgent
+from vlagents_ray.serve.python_env.child_main import Settings
 
+ROOT = Path(__file__).parents[3]
 ALL = ["logprob", "entropy", "replay"]
 LEVEL = 0.5
 SUMMED = 2e-3  # how far a sum of 25 log-probabilities may be off, in float32: each is of a step of about 0.1
@@ -163,6 +171,25 @@ def test_plans_samples_and_random_steps_are_those_without_compilation(
 def test_it_acts_with_pushed_weights(compiled: Pi0, programs: list[int]) -> None:
     check_pushed_weights(compiled, lambda: begun(compiled, 0).act(seen(0)).action)
     assert programs == [SIZE, SIZE]
+
+
+def test_in_a_child_process_it_acts_with_pushed_weights(folder: Path) -> None:
+    policy = made(folder)
+    pushed = {name: 0.8 * value if value.is_floating_point() else value for name, value in policy.parameters().items()}
+    settings = Settings("pi0", {"checkpoint": str(folder)}, 1, "1")
+    served = Engine(ChildAgent(Child(sys.executable, settings, {"PYTHONPATH": str(ROOT)})))
+    served.start()
+    try:
+        Publisher(served).push(pushed)
+        answered(served, "a", Request("reset", seen(0), WORDS[0], kwargs={"seed": 0}, rank="simulation"))
+        act = answered(served, "a", Request("act", seen(0), rank="simulation")).act
+    finally:
+        served.close()
+    before = begun(policy, 0).act(seen(0)).action
+    policy.load_parameters(pushed)
+    assert act.info["policy"]["version"] == 1
+    np.testing.assert_allclose(act.action, begun(policy, 0).act(seen(0)).action, atol=BATCHED)
+    assert np.abs(act.action - before).max() > 100 * BATCHED
 
 
 @pytest.mark.parametrize("samples", [0, 2])

@@ -13,7 +13,7 @@ from fake_cuda import FakeCuda
 from vlagents_ray.interface import Act, Agent, Obs
 from vlagents_ray.serve.weights import ModelWeights, PushOptions, WeightsVersion
 from vlagents_ray.weights import trainable
-from vlagents_ray.weights.trainable import are_apart, copy, fingerprint, portable
+from vlagents_ray.weights.trainable import are_apart, copy, fingerprint, portable, set_values
 
 pytestmark = pytest.mark.torch
 
@@ -257,3 +257,11 @@ def test_tensors_in_each_others_memory_are_not_swapped() -> None:
     assert are_apart({"a": memory[:6], "b": memory[6:], "tied": memory[:6]})
     assert not are_apart({"a": memory, "b": memory[6:]})
     assert not are_apart({"a": memory, "b": memory.t()})
+
+
+def test_tensors_of_a_tree_keep_their_addresses(cuda: FakeCuda) -> None:
+    held = cuda.tensor(torch.zeros(SIZE))
+    tree = {"head": {"weight": held}}
+    set_values(tree, {"head/weight": cuda.tensor(torch.ones(SIZE))})
+    assert tree["head"]["weight"] is held
+    assert held.values.tolist() == [1] * SIZE

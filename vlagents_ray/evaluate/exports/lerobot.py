@@ -33,12 +33,14 @@ from vlagents_ray.robot.episode import (
     ACTION,
     ENVIRONMENT,
     INDEX,
+    OUTCOMES,
     STATE,
     Finished,
     ImageStatistics,
     Stats,
     camera_keys,
     number_features,
+    outcome_rows,
     parts_of,
     state_vector,
     vector_feature,
@@ -48,8 +50,6 @@ from vlagents_ray.robot.episode import (
 
 GRIPPER_FEATURE = "observation.gripper"
 VERSION = "policy_version"
-# LeRobot's own names for the outcome of an action; `success` is that of the state after it.
-OUTCOMES = {"next.reward": "float32", "next.success": "bool", "next.done": "bool"}
 
 
 def to_lerobot(
@@ -259,15 +259,10 @@ def _finished(one: _Demonstration, angles: Mapping[int, Centre], folder: Path) -
 
 def _numbers(one: _Demonstration, about: DatasetContract) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
     """Return rows and features: the state in one vector and part by part, the action, and its outcome."""
-    frames, dim = one.actions.shape
+    dim = one.actions.shape[1]
     together, names = state_vector(one.state, one.gripper, one.parts)
     together = about.wrapped(together)
-    rows = {
-        ACTION: one.actions,
-        "next.reward": one.rewards.astype(np.float32),
-        "next.success": one.success,
-        "next.done": np.arange(frames) == frames - 1,
-    }
+    rows: dict[str, Any] = {ACTION: one.actions, **outcome_rows(one.rewards, one.success)}
     features = {ACTION: vector_feature([f"action_{i}" for i in range(dim)]), **number_features(OUTCOMES | INDEX)}
     features[ACTION]["spec"] = one.cell.contract.get("action")
     if names:

@@ -565,8 +565,13 @@ class Single(Kind):
     def horizon(self) -> int:
         return 1
 
+    @property
+    def dim(self) -> int:
+        return super().dim + (self.config.num_discrete_actions is not None)  # the gripper's choice, which comes last
+
     def _alone(self, batch: dict[str, Any], row: Row) -> Any:
-        return self.policy.select_action(batch)[:, None]
+        inputs = {key: batch[key] for key in self.config.input_features}  # the gripper's network takes no others
+        return self.policy.select_action(inputs)[:, None]
 
 
 RESIZING = {"groot", "smolvla", "pi0", "pi05", "pi0_fast", "wall_x"}  # types that resize images themselves

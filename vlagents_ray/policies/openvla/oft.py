@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
@@ -58,6 +58,7 @@ class OpenVLAOFT(prismatic.PrismaticPolicy):
     Config = OpenVLAOFTConfig
     config: OpenVLAOFTConfig
     model: Parallel
+    trainable = "model.trained"
 
     def __init__(self, config: OpenVLAOFTConfig) -> None:
         super().__init__(config)
@@ -197,6 +198,17 @@ class Parallel:
     film: Film | None
     steps: tuple[int, int]  # diffusion steps: in training, at inference
 
+    @property
+    def trained(self) -> dict[str, Any]:
+        """The parts that upstream's training saves: modules, and tensors by their names in its files."""
+        added = {
+            "action_head": self.head,
+            "proprio_projector": self.proprio,
+            "noisy_action_projector": self.noisy,
+            "film": self.film,
+        }
+        return {"vla": self.base.network, **{name: part.weights for name, part in added.items() if part is not None}}
+
     def compile_with(self, compilation: Compilation) -> None:
         self.encode_images = compilation.core("vision encoder", self.encode_images)  # type: ignore[method-assign]
         self.hidden_states = compilation.core("language model", self.hidden_states)  # type: ignore[method-assign]
@@ -325,7 +337,7 @@ def _kept(trained: int) -> list[float]:
     return kept
 
 
-Weights = Mapping[str, Any]  # tensors by name
+Weights = dict[str, Any]  # tensors by name
 
 _MLP = ("layer_norm1", "fc1", *(f"mlp_resnet_blocks.{i}.ffn.{j}" for i in (0, 1) for j in (0, 1)), "layer_norm2", "fc2")
 _WRAPPED = "module."  # prefix of all names after distributed training
@@ -367,28 +379,32 @@ def _exactly(found: Weights, layers: Iterable[str], what: str) -> Weights:
 class Component:
     """A part that fine-tuning added to OpenVLA, by the names of its tensors."""
 
-    _weights: Weights
+    weights: Weights  # by upstream's names, which a learner pushes
+    _prefix = ""  # of all names
 
     def to(self, **place: Any) -> Self:
-        self._weights = {key: tensor.to(**place) for key, tensor in self._weights.items()}
+        self.weights = {key: tensor.to(**place) for key, tensor in self.weights.items()}
         return self
 
     def _linear(self, layer: str, x: Any) -> Any:
         import torch  # the compiler follows an import statement, but not `require`
 
-        return torch.nn.functional.linear(x, self._weights[f"{layer}.weight"], self._weights[f"{layer}.bias"])
+        return torch.nn.functional.linear(x, *self._of(layer))
+
+    def _of(self, layer: str) -> tuple[Any, Any]:
+        return self.weights[f"{self._prefix}{layer}.weight"], self.weights[f"{self._prefix}{layer}.bias"]
 
 
 class Mlp(Component):
     """A head: an MLP with residual blocks over the hidden states of one row's action tokens."""
 
     def __init__(self, saved: Weights, prefix: str) -> None:
-        own = _exactly(saved, [f"{prefix}.{layer}" for layer in _MLP], "action_head")
-        self._weights = {key.removeprefix(f"{prefix}."): tensor for key, tensor in own.items()}
+        self.weights = _exactly(saved, [f"{prefix}.{layer}" for layer in _MLP], "action_head")
+        self._prefix = f"{prefix}."
 
     @property
     def dim(self) -> int:
-        return len(self._weights["fc2.bias"])
+        return len(self._of("fc2")[1])
 
     def __call__(self, x: Any) -> Any:
         relu = require("torch").relu
@@ -399,19 +415,19 @@ class Mlp(Component):
         return self._linear("fc2", self._norm("layer_norm2", x))
 
     def _norm(self, layer: str, x: Any) -> Any:
-        bias = self._weights[f"{layer}.bias"]
-        return require("torch").nn.functional.layer_norm(x, bias.shape, self._weights[f"{layer}.weight"], bias)
+        weight, bias = self._of(layer)
+        return require("torch").nn.functional.layer_norm(x, bias.shape, weight, bias)
 
 
 class Projector(Component):
     """Maps numbers to embeddings of the language model, by two layers with GELU between them."""
 
     def __init__(self, saved: Weights, what: str) -> None:
-        self._weights = _exactly(saved, ("fc1", "fc2"), what)
+        self.weights = _exactly(saved, ("fc1", "fc2"), what)
 
     @property
     def dim(self) -> int:
-        return int(self._weights["fc1.weight"].shape[1])
+        return int(self.weights["fc1.weight"].shape[1])
 
     def __call__(self, x: Any) -> Any:
         return self._linear("fc2", require("torch").nn.functional.gelu(self._linear("fc1", x)))
@@ -437,7 +453,7 @@ class Film(Component):
         layers = [
             f"{n}.blocks.{i}.{way}" for n, v in vits.items() for i in range(len(v.blocks)) for way in ("scale", "shift")
         ]
-        self._weights, self._vits = _exactly(film, layers, "vision_backbone"), vits
+        self.weights, self._vits = _exactly(film, layers, "vision_backbone"), vits
 
     def __call__(self, pixels: Any, language: Any) -> Any:
         """Return patches (B, P, V) of pixels (B, C, S, S) for instructions (B, D), each the mean of its embeddings."""

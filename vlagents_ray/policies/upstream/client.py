@@ -12,6 +12,7 @@ import numpy as np
 
 from vlagents_ray.errors import ConnectionLost, MalformedMessage, PolicyFailed, PolicyUnavailable
 from vlagents_ray.protocol.messages import DEFAULT_LIMITS, Limits
+from vlagents_ray.wire.mapping import matches
 from vlagents_ray.wire.outgoing import Outgoing
 
 logger = logging.getLogger(__name__)
@@ -76,17 +77,31 @@ class UpstreamClient(abc.ABC):
         """Close the connection; repeated calls are allowed."""
 
     def differences(self, metadata: Mapping[str, Any], outgoing: Outgoing) -> list[str]:
-        """Return the differences between the upstream's metadata and the mapping, each with its cure."""
+        """Return the differences between the upstream's metadata and the mapping, each with its cure.
+
+        SGLang ignores a camera that is not in its `image_keys`, and acts as if the robot had none. One of them that the
+        mapping lacks may be missing on purpose.
+        """
+        stated = metadata.get("input")
+        keys = stated.get("image_keys") if isinstance(stated, Mapping) else None
+        if not isinstance(keys, list):
+            return []
+        known = {f"{prefix}{key}" for key in keys for prefix in ("", "images/", "observation.images.")}
+        given = [camera.key.partition("|")[0] for camera in outgoing.mapping.cameras.values()]
+        if wrong := [key for key in given if not any(matches(one, key) for one in known)]:
+            return [f"cameras: the upstream reads {keys}, the mapping gives {wrong}; change mapping.cameras"]
         return []
 
     def chunk(self, metadata: Mapping[str, Any]) -> int | None:
-        """Return the number of rows of the upstream's actions, if its metadata states it."""
-        return None
+        """Return the number of rows of the upstream's actions, if its metadata states it, in SGLang's `output`."""
+        output = metadata.get("output")
+        rows = (output if isinstance(output, Mapping) else metadata).get("action_horizon")
+        return rows if type(rows) is int and rows > 0 else None
 
-    def failed(self, text: object) -> PolicyFailed:
+    def failed(self, text: object, got: str = "an error") -> PolicyFailed:
         """Log an error that the upstream sent, and return ours, without the upstream's details."""
-        logger.error("upstream %s answered with an error: %s", self.options.url, str(text)[:_LOGGED])
-        return PolicyFailed(f"upstream {self.options.url}: it answered with an error, which the server's log has")
+        logger.error("upstream %s answered with %s: %s", self.options.url, got, str(text)[:_LOGGED])
+        return PolicyFailed(f"upstream {self.options.url}: it answered with {got}, whose text the server's log has")
 
     def closed(self) -> ConnectionLost:
         """Return the error of a request over a closed connection."""

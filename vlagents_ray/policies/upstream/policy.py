@@ -21,7 +21,7 @@ from vlagents_ray.policies.outcomes import attempt, of_good
 from vlagents_ray.policies.upstream.client import ClientOptions, UpstreamClient
 from vlagents_ray.policies.upstream.connections import Lanes, SessionConnections
 from vlagents_ray.policies.upstream.gr00t import GR00TClient
-from vlagents_ray.policies.upstream.openvla import OpenVLAClient
+from vlagents_ray.policies.upstream.http import FlashRTClient, OpenVLAClient, SGLangClient
 from vlagents_ray.policies.upstream.vlagents import VlagentsClient
 from vlagents_ray.policies.upstream.websocket import OpenPiBatchClient, OpenPiClient, RoboArenaClient, VlaEvalClient
 from vlagents_ray.wire.mapping import KeyMapping
@@ -36,18 +36,22 @@ PROTOCOLS: dict[str, type[UpstreamClient]] = {
     "openvla": OpenVLAClient,
     "vla_eval": VlaEvalClient,
     "vlagents": VlagentsClient,
+    "sglang": SGLangClient,
+    "flashrt": FlashRTClient,
 }
 
 
 class UpstreamConfig(BaseModel, extra="forbid"):
     """The address, protocol and time limits of the other policy server."""
 
-    protocol: Literal["openpi", "openpi-batch", "roboarena", "gr00t", "openvla", "vla_eval", "vlagents"]
+    protocol: Literal[
+        "openpi", "openpi-batch", "roboarena", "gr00t", "openvla", "vla_eval", "vlagents", "sglang", "flashrt"
+    ]
     urls: list[str] = Field(
         min_length=1,
         max_length=64,
         description="of servers with the same model, e.g. ws://gpu-box:8000, tcp://gpu-box:5555 (gr00t), "
-        "http://gpu-box:8000 (openvla); a batch is spread over them",
+        "http://gpu-box:8000 (openvla, sglang, flashrt); a batch is spread over them",
     )
     mapping: str | dict[str, Any] | None = Field(
         default=None,

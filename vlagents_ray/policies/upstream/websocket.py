@@ -129,11 +129,21 @@ class OpenPiClient(WebSocketClient):
         return self._map(data)
 
     def _map(self, data: bytes | str) -> dict[str, Any]:
-        """Return the map in a message; a text message is an error, after which the upstream closes the connection."""
-        if isinstance(data, str):
+        """Return the map in a message; an error that is a text, or has the key `error`, ends the connection."""
+        reply: dict[str, Any] = self._good(data if isinstance(data, str) else openpi.decode(data, self.options.limits))
+        return reply
+
+    def _good(self, reply: Any) -> Any:
+        """Return a reply that is no error: openpi's is a text, SGLang's and vLLM-Omni's are maps."""
+        if isinstance(reply, str):
             self.close()
-            raise self.failed(data)
-        return openpi.decode(data, self.options.limits)
+            raise self.failed(reply)
+        if isinstance(reply, dict) and reply.get("error") is not None:
+            self.close()
+            raise self.failed(reply["error"])
+        if isinstance(reply, dict) and reply.get("type") == "error":
+            raise self.failed(reply.get("message"))
+        return reply
 
     def _actions(self, reply: Any) -> np.ndarray:
         actions = reply.get("actions") if isinstance(reply, dict) else None
@@ -183,7 +193,7 @@ class RoboArenaClient(OpenPiClient):
         cameras = [camera.key.partition("|")[0] for camera in outgoing.mapping.cameras.values()]
         found = []
         external = metadata.get("n_external_cameras")
-        have = sum("exterior" in key for key in cameras)
+        have = sum("wrist" not in key for key in cameras)  # vLLM-Omni's π0 has no key with "exterior"
         if isinstance(external, int) and external > have:
             found.append(
                 f"cameras: the upstream needs {external} external ones, the mapping has {have}; "
@@ -196,11 +206,8 @@ class RoboArenaClient(OpenPiClient):
         return found
 
     def _read(self, data: bytes | str) -> Any:
-        """Return a map, or the array that older servers send; vLLM-Omni sends an error as a map."""
-        reply = self._map(data) if isinstance(data, str) else openpi.decode_any(data, self.options.limits)
-        if isinstance(reply, dict) and reply.get("type") == "error":
-            raise self.failed(reply.get("message"))
-        return reply
+        """Return a map, or the array that older servers and vLLM-Omni send."""
+        return self._good(data if isinstance(data, str) else openpi.decode_any(data, self.options.limits))
 
 
 _STATED = ("model_server", "harness_version", "protocol_version", "observation_params", "action_spec")

@@ -1,0 +1,90 @@
+"""Record an expert's corrections of the reference policy: `python reference/dagger.py --help`.
+
+The policy plays the tabletop until the expert takes over, at a tick drawn by the seed, as soon as the gripper is open,
+so that it drops nothing. What it then shows are states that the policy reaches (DAgger, arXiv 1011.0686; with an expert
+that takes over: HG-DAgger, arXiv 1810.02890). Episodes that the policy solves before are not recorded.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import time
+from pathlib import Path
+from typing import Annotated
+
+import numpy as np
+import typer
+
+from vlagents_ray.envs import EvalEnv, make_env
+from vlagents_ray.errors import InvalidObservation
+from vlagents_ray.evaluate import Results, compare
+from vlagents_ray.interface import Act
+from vlagents_ray.policies.experts.tabletop import TabletopExpert
+from vlagents_ray.policies.reference import Reference
+from vlagents_ray.robot.dataset import Dataset
+
+TAKE_OVER = 20  # ticks within which the expert may; an episode of a success has 31
+OPEN = 0.9  # opening of a gripper that holds nothing
+EXECUTE = 4  # rows of a chunk, as in the evaluation
+HZ = 20  # of the tabletop
+app = typer.Typer(pretty_exceptions_enable=False)
+
+
+def correct(env: EvalEnv, policy: Reference, dataset: Dataset, seed: int) -> bool:
+    """Play an episode, and keep it if the expert solved it; returns whether it did."""
+    obs, _ = env.reset(seed=seed)
+    policy.reset(obs, env.instruction, seed=seed)
+    expert, due, rows = TabletopExpert("tabletop"), np.random.default_rng(seed).integers(TAKE_OVER), np.zeros((0, 4))
+    episode, led, solved = dataset.begin(env.instruction, env.contract.action), False, False
+    for tick in range(env.max_steps):
+        if not led and tick >= due and (obs.gripper or 0.0) > OPEN:
+            with contextlib.suppress(InvalidObservation):  # the gripper hides an object; the policy goes on
+                expert.reset(obs, env.instruction)
+                led = True
+        if led:
+            try:
+                action = expert.act(obs).action
+            except InvalidObservation:
+                break
+        else:
+            rows = rows if len(rows) else policy.act(obs).rows()
+            action, rows = rows[0], rows[1:]
+        episode.add(obs, action, tick / HZ, tick, False, led)
+        obs, _, _, _, info = env.step(Act(action))
+        if solved := bool(info["success"]):
+            break
+    if led and solved:
+        dataset.save(episode.finish("success"))
+    else:
+        episode.abandon()
+    return led and solved
+
+
+@app.command()
+def record(
+    checkpoint: Annotated[Path, typer.Argument(help="Of the policy.")],
+    out: Annotated[Path, typer.Argument(help="New folder of a LeRobotDataset with interventions.")],
+    episodes: Annotated[int, typer.Option(min=1, help="That are played.")] = 800,
+    seed: Annotated[int, typer.Option(help="Of the first one; those of the evaluation begin at 0.")] = 2_000_000,
+) -> None:
+    """Record corrections, losslessly, as the policy gets images without loss."""
+    policy = Reference.from_config({"checkpoint": str(checkpoint), "embodiment": "tabletop", "execute": EXECUTE})
+    policy.initialize()
+    begun = time.monotonic()
+    with make_env("tabletop", cameras=["front", "wrist"], width=64, height=64) as env:
+        dataset = Dataset(out, HZ, interventions=True, lossless=True, durable=False)
+        kept = sum(correct(env, policy, dataset, number) for number in range(seed, seed + episodes))
+    typer.echo(f"{kept} of {episodes} episodes corrected, in {time.monotonic() - begun:.0f} s")
+
+
+@app.command("compare")
+def compare_after(out: Annotated[Path, typer.Argument(help="Results of before and after, on the same seeds.")]) -> None:
+    """Print the paired comparison of an evaluation, by McNemar's exact test."""
+    total = compare(Results.load(out), "after", "before").total
+    pairs, (low, high) = total.pairs, total.interval
+    typer.echo(f"solved after only {pairs.only_a}, before only {pairs.only_b}, both {pairs.both} of {pairs.total}")
+    typer.echo(f"difference {pairs.difference:+.1%} [{low:+.1%}, {high:+.1%}], p {pairs.p_value:.2g}")
+
+
+if __name__ == "__main__":
+    app()

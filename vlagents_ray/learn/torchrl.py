@@ -1,0 +1,237 @@
+"""TorchRL's policies on this server, and served policies as modules of TorchRL; needs the extra "torchrl".
+
+A program that starts TorchRL's `ProcessInferenceServer` with an `MPTransport` uses this server after one more line:
+
+    from vlagents_ray.learn.torchrl import PolicyServer as ProcessInferenceServer, ServerAddress as MPTransport
+
+Keys are those of `torchrl.data.vla`: of the image (camera "front"), the state (part "state") and the instruction.
+"""
+
+from __future__ import annotations
+
+import os
+import sys
+import tempfile
+from collections.abc import Iterable, Mapping, Sequence
+from contextlib import ExitStack
+from pathlib import Path
+from typing import Any, ClassVar
+
+import numpy as np
+from typing_extensions import Self
+
+from vlagents_ray.client.agent import RemoteAgent
+from vlagents_ray.contract import ActionSpec, Contract
+from vlagents_ray.errors import ConfigError
+from vlagents_ray.interface import BEHAVIOUR, POLICY, WANT, Act, Agent, Obs
+from vlagents_ray.learn.columns import REPLAY
+from vlagents_ray.policies.base.model_inputs import camera_images, state_vector
+from vlagents_ray.policies.outcomes import attempt, of_good
+from vlagents_ray.registry import named_class, require
+from vlagents_ray.serve.ports import free_port
+from vlagents_ray.weights.trainable import named_values, set_values
+
+torch: Any = require("torch")
+nn: Any = require("tensordict.nn", extra="torchrl")
+vla: Any = require("torchrl.data.vla", extra="torchrl")
+IMAGE, STATE, TEXT = vla.IMAGE_KEY, vla.STATE_KEY, vla.INSTRUCTION_KEY
+_CAMERA, _PART, _TOKENS, _LEARNED = "front", "state", "tokens", ("logprob", REPLAY)
+
+
+class ServedPolicy(nn.TensorDictModuleBase):  # type: ignore[misc]
+    """A policy on a server as a module of TorchRL.
+
+    It reads images (*B, 3, H, W) uint8, a state (*B, D) float32 and instructions, and adds "chunk" (*B, H, D) float32,
+    or "tokens" (*B, H, D) int64 and "log_probs" in nats, or all, below "vla_action". Tokens are drawn where TorchRL's
+    exploration type is RANDOM. Each row is a session, whose episode begins where "is_init" is true (TorchRL's
+    `InitTracker`) and where the instruction changes. Copies, also in other processes, have their own sessions.
+    """
+
+    def __init__(self, url: str, **options: Any) -> None:
+        """Set the server, to which the first call connects; the arguments are those of `RemoteAgent`."""
+        super().__init__()
+        self.in_keys, self.out_keys = [IMAGE, STATE, TEXT], [vla.ACTION_CHUNK_KEY, "policy_version"]
+        self._url, self._options = url, {"rank": "simulation", **options}
+        self._sessions: list[RemoteAgent] = []
+
+    def forward(self, batch: Any) -> Any:
+        """Add the policy's acts to a tensordict of observations, and return it; raises the errors of `RemoteAgent`."""
+        rows = batch.reshape(-1)
+        obs, words, first = [*map(_observation, rows)], rows.get(TEXT), rows.get("is_init", None)
+        words = [words] * len(obs) if isinstance(words, str) else words.tolist()
+        if not self._sessions:
+            self._sessions, self._words = [RemoteAgent(self._url, **self._options)], dict[int, str]()
+            self._contract, self._seeds = self._sessions[0].contract or Contract(), np.random.default_rng()
+        agent = self._sessions[0]
+        self._sessions += agent.sessions(len(obs) - len(self._sessions))
+        results: list[Any] = []
+        begun = [i for i, text in enumerate(words) if self._words.get(i) != text or (first is not None and first[i])]
+        if begun:
+            of_begun: Any = zip(*((obs[i], words[i], self._sessions[i]) for i in begun), strict=True)
+            results += agent.reset_batch(*of_begun, seeds=self._seeds.integers(2**31, size=len(begun)).tolist())
+            self._words |= {i: words[i] for i in begun}
+        if nn.probabilistic.interaction_type() == nn.InteractionType.RANDOM:
+            want = [name for name in _LEARNED if name in (self._contract.behaviour or ())]
+            obs = [Obs(one.cameras, state=one.state, info={WANT: want}) for one in obs]
+        results += agent.act_batch(obs, self._sessions[: len(obs)])
+        for error in (one for one in results if isinstance(one, Exception)):
+            raise error
+        for key, values in self._outputs(results[-len(obs) :]).items():
+            batch.set(key, torch.from_numpy(np.stack(values)).reshape((*batch.batch_size, *values[0].shape)))
+        return batch
+
+    def _outputs(self, acts: Sequence[Act]) -> dict[Any, list[np.ndarray]]:
+        found: dict[Any, Any] = {"policy_version": [np.array(act.info[POLICY]["version"], np.int64) for act in acts]}
+        if self._contract.action.space != _TOKENS:
+            found[vla.ACTION_CHUNK_KEY] = [act.rows() for act in acts]
+        stated = [act.info.get(BEHAVIOUR, {}) for act in acts]
+        if all(_TOKENS in one.get(REPLAY, {}) for one in stated):
+            found[vla.ACTION_TOKENS_KEY] = [np.array(one[REPLAY][_TOKENS], np.int64) for one in stated]
+            found[vla.VLA_ACTION_KEY, "log_probs"] = [np.array(one["logprob"], np.float32) for one in stated]
+        return found
+
+    def close(self) -> None:
+        """End the sessions; a later call begins others."""
+        while self._sessions:
+            self._sessions.pop().close()
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {**self.__dict__, "_sessions": []}
+
+
+class TorchRLPolicy(Agent):
+    """A VLA policy of TorchRL (`VLAWrapperBase`), which returns chunks, or tokens if it has no `action_tokenizer`.
+
+    Tokens are drawn by the session's generator if a learner requests values; else they are the likeliest. `factory`
+    makes the policy: "module:function", or a file with the function by cloudpickle, trusted, as it may run any code.
+    """
+
+    trainable: ClassVar[str | None] = "policy"
+
+    def __init__(self, factory: str) -> None:
+        self._factory = factory
+        self.policy: Any = None
+
+    @property
+    def contract(self) -> Contract | None:
+        if (policy := self.policy) is None:
+            return None
+        tokens = policy.action_head == "tokens"
+        action = ActionSpec(policy.action_dim, _TOKENS if tokens and policy.action_tokenizer is None else None)
+        return Contract(action=action, chunk=policy.chunk_size, behaviour=_LEARNED if tokens else None)
+
+    def initialize(self) -> None:
+        from ray import cloudpickle
+
+        file = Path(self._factory)
+        make: Any = cloudpickle.loads(file.read_bytes()) if file.is_file() else named_class(self._factory, {})
+        self.policy = make().eval()
+
+    def parameters(self) -> dict[str, Any]:
+        # Lazy layers get their sizes from the first batch; until then there is nothing to push or to compare.
+        lazy = any(map(torch.nn.parameter.is_lazy, self.policy.parameters()))
+        return {} if lazy else named_values(self.policy)
+
+    def load_parameters(self, named: Mapping[str, Any]) -> None:
+        set_values(self.policy, named)
+
+    def reset(self, obs: Obs, instruction: str | None, **kwargs: Any) -> dict[str, Any]:
+        self._words, self._draws = instruction or "", np.random.default_rng(int(kwargs.get("seed") or 0) % 2**64)
+        return {}
+
+    def act_batch(self, obs: Sequence[Obs], sessions: Sequence[Any]) -> list[Act | Exception]:
+        return of_good([attempt(_row, one, session) for one, session in zip(obs, sessions, strict=True)], self._acts)
+
+    def _acts(self, rows: list[tuple[Any, np.random.Generator | None]]) -> Iterable[Act]:
+        policy, device = self.policy, next(self.policy.parameters()).device
+        batch = torch.stack([row for row, _ in rows]).contiguous().to(device)
+        with torch.no_grad():
+            if policy.action_head == "continuous":
+                return [Act(chunk) for chunk in policy(batch)[vla.ACTION_CHUNK_KEY].float().cpu().numpy()]
+            distribution = policy.get_dist(batch)
+            logits = getattr(distribution, "base_dist", distribution).logits  # (B, H, D, tokens)
+            # The largest logit after Gumbel noise is that of a draw from their softmax.
+            noise = [np.zeros(logits[0].shape) if rng is None else rng.gumbel(size=logits[0].shape) for _, rng in rows]
+            tokens = (logits + torch.from_numpy(np.stack(noise)).to(device, logits.dtype)).argmax(-1)
+            logprobs = distribution.log_prob(tokens)  # (B,), or (B, H, D) with `log_probs_mode="token"`
+            actions = tokens if policy.action_tokenizer is None else policy.action_tokenizer.decode(tokens)
+        found = zip(*(one.cpu().numpy() for one in (actions.float(), tokens, logprobs.float())), strict=True)
+        return [Act(act, info={BEHAVIOUR: {"logprob": logp, REPLAY: {_TOKENS: own}}}) for act, own, logp in found]
+
+
+class ServerAddress:
+    """The address of a `PolicyServer` that starts later, in the place of TorchRL's `MPTransport`."""
+
+    def __init__(self, **_of_torchrl: Any) -> None:
+        self.port = free_port()
+
+    def client(self) -> ServedPolicy:
+        """Return a client, whose first call waits for the server."""
+        return ServedPolicy(f"http://127.0.0.1:{self.port}")
+
+    def close(self) -> None:
+        """Do nothing, since a server closes its port itself."""
+
+
+class PolicyServer:
+    """A server of a `VLAWrapperBase` on a Ray that it starts, with the arguments of TorchRL's `ProcessInferenceServer`.
+
+    `server_config.max_batch_size` limits its batches, which wait as `batch.patience` of deployment files states. For a
+    `policy_device` "cuda", Ray reserves a GPU. Other arguments have no meaning here.
+    """
+
+    def __init__(
+        self, *, policy_factory: Any, transport: Any, server_config: Any = None, policy_device: Any = "cpu", **_: Any
+    ) -> None:
+        if not isinstance(transport, ServerAddress):
+            raise ConfigError(f"transport: got {type(transport).__name__}, want ServerAddress; import both names")
+        self.transport, self._factory, self._running = transport, policy_factory, ExitStack()
+        self._batch = {} if server_config is None else {"max_size": server_config.max_batch_size}
+        self._resources = {"num_gpus": float(torch.device(policy_device).type == "cuda")}
+
+    def start(self) -> Self:
+        """Serve the policy, and wait until it is loaded."""
+        # Processes of environments import this module for the client alone, which does without Ray.
+        from ray import cloudpickle
+
+        from vlagents_ray.learn.publisher import Publisher
+        from vlagents_ray.serve.launch.deployment_file import deployment
+        from vlagents_ray.serve.launch.server import running_server
+
+        with ExitStack() as stack:
+            file = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="vlr-torchrl-"))) / "factory"
+            file.write_bytes(cloudpickle.dumps(self._factory))
+            path = {"env_vars": {"PYTHONPATH": os.pathsep.join(filter(None, sys.path))}}  # of the factory's modules
+            args = {"batch": self._batch, "resources": self._resources, "environment": path}
+            plan = deployment(f"{__name__}:TorchRLPolicy", config={"factory": str(file)}, **args)
+            stack.enter_context(running_server(plan, port=self.transport.port))
+            self._publisher = Publisher(f"serve://{plan.applications[0].name}")
+            self._running = stack.pop_all()
+        return self
+
+    def update_model_weights(self, weights: Any, **_: Any) -> dict[str, bool]:
+        """Push a tensordict of parameters, all or some, for all later acts; raises the errors of `Publisher.push`."""
+        named = dict(weights.flatten_keys(".").items())
+        if all(value.numel() for value in named.values()):  # lazy layers of a learner have none before its first batch
+            self._publisher.push(named, mode="keep", partial=True, allow_same=True)
+        return {"accepted": True}
+
+    def shutdown(self, timeout: float | None = None) -> None:
+        """Stop the server and its Ray."""
+        self._running.close()
+
+
+def _observation(row: Any) -> Obs:
+    image, state = row.get(IMAGE, None), row.get(STATE, None)
+    cameras = {} if image is None else {_CAMERA: image.movedim(0, -1).contiguous().cpu().numpy()}
+    return Obs(cameras, state={} if state is None else {_PART: state.float().cpu().numpy()})
+
+
+def _row(obs: Obs, session: TorchRLPolicy) -> tuple[Any, np.random.Generator | None]:
+    """Return a session's input for the policy, and the generator of its draw, if any."""
+    row = require("tensordict", extra="torchrl").TensorDict({TEXT: session._words}, [])
+    if IMAGE in session.policy.in_keys:
+        row[IMAGE] = torch.from_numpy(camera_images(obs, {_CAMERA: _CAMERA})[_CAMERA].copy()).movedim(-1, 0)
+    if STATE in session.policy.in_keys:
+        row[STATE] = torch.from_numpy(state_vector(obs, [_PART]))
+    return row, session._draws if obs.info.get(WANT) else None
