@@ -67,7 +67,9 @@ def _pages(section: Any) -> list[Any]:
 
 
 def _entry(page: Any) -> str:
-    """A page's line: its title, where it stands, and its first sentence."""
+    """A page's line: its title, where it stands, and its first sentence, which a page in HTML does not have."""
+    if not page.file.is_documentation_page():
+        return f"- [{page.title}]({page.file.dest_uri})"
     title, _, rest = re.sub(r"<!--.*?-->", "", page.file.content_string, flags=re.DOTALL).lstrip("# \n").partition("\n")
     prose = next((block for block in rest.split("\n\n") if re.match(r"\s*(?!```)[\w`*\[]", block)), "")
     plain = re.sub(r"\[([^\]]*)\]\([^)]*\)", r"\1", " ".join(prose.split()))

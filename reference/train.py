@@ -237,9 +237,9 @@ def fit(
         losses += [loss for loss, _ in found]
         done = step + 1
         if done % SHOWN_EVERY == 0 or done == steps:
-            rate = (done - first) * BATCH / (time.monotonic() - begun)
+            speed = (done - first) * BATCH / (time.monotonic() - begun)
             loss, error = np.mean(losses[-threads * SHOWN_EVERY :], axis=0)
-            typer.echo(f"step {done} of {steps}: loss {loss:.4f}, objects {error:.4f}, {rate:.0f} frames/s")
+            typer.echo(f"step {done} of {steps}: loss {loss:.4f}, objects {error:.4f}, {speed:.0f} frames/s")
         if done % KEEP_EVERY == 0 and done < steps:
             state = {"training": training.state_dict(), "average": average.state_dict(),
                      "optimizer": optimizer.state_dict(), "step": done}  # fmt: skip

@@ -76,6 +76,7 @@ def test_a_training_that_was_cut_off_and_a_second_one_end_with_the_same_weights(
     checkpoint, frames = train.read(data, CAMERAS, tmp_path / "images")
     monkeypatch.setattr(train, "KEEP_EVERY", 3)
     whole = train.fit(checkpoint, frames, 5, 0, tmp_path / "whole.pt")
+    monkeypatch.setattr(train, "SHOWN_EVERY", 2)  # what is shown changes no weight
     other = train.fit(checkpoint, frames, 5, 1, tmp_path / "other.pt")
 
     def kept_and_cut(part: Path, kept: Path) -> None:
