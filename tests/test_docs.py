@@ -12,6 +12,7 @@ import pytest
 import yaml
 from ray.serve.schema import ServeApplicationSchema
 from readme_blocks import PAGES, commands, read_as_typed
+from tables import section
 
 from vlagents_ray.cli.evaluate import read_run
 from vlagents_ray.envs import aloha, calvin, metaworld, robocasa
@@ -42,7 +43,8 @@ _OVER_THE_LINK = {
     "*vlagents, JPEG*": "*vlagents JPEG*",
     "*openpi*": "*openpi*",
 }
-BLOCKS = re.findall(r"```yaml\n(.*?)```", (DOCS / "environments.md").read_text(), re.DOTALL)
+_ENVIRONMENTS = (DOCS / "serving.md").read_text().partition("\n## Python environments\n")[2]
+BLOCKS = re.findall(r"```yaml\n(applications:.*?)```", _ENVIRONMENTS, re.DOTALL)
 
 
 @pytest.mark.parametrize("block", BLOCKS)
@@ -92,7 +94,7 @@ def test_the_file_of_runs_behind_the_reports_picture_is_accepted() -> None:
 
 
 def test_files_of_runs_on_the_pages_are_accepted() -> None:
-    others = [DOCS / "cluster" / "placement.md", DOCS / "evaluation" / "robot.md"]
+    others = [DOCS / "cluster" / "scaling.md", DOCS / "evaluation" / "robot.md"]
     pages = [*sorted((DOCS / "benchmarks").glob("*.md")), *others]
     blocks = [
         block for page in pages for block in re.findall(r"```yaml\n(policies:.*?)```", page.read_text(), re.DOTALL)
@@ -105,18 +107,17 @@ def test_files_of_runs_on_the_pages_are_accepted() -> None:
 @pytest.mark.parametrize(
     ("page", "protocol"),
     [
-        ("metaworld", metaworld.PROTOCOL),
-        ("aloha", aloha.PROTOCOL),
-        ("pusht", known("gym_pusht/PushT-v0").protocol),
-        ("gymnasium", known("FetchReach-v4").protocol),
-        ("robosuite", TASKS["Lift"].protocol),
-        ("calvin", calvin.PROTOCOL),
-        ("robocasa", robocasa.protocol("OpenDrawer", "target")),
+        ("gymnasium#meta-world", metaworld.PROTOCOL),
+        ("gymnasium#aloha", aloha.PROTOCOL),
+        ("gymnasium#pusht", known("gym_pusht/PushT-v0").protocol),
+        ("gymnasium#fetch-gymnasium-robotics", known("FetchReach-v4").protocol),
+        ("robosuite#robosuite", TASKS["Lift"].protocol),
+        ("other#calvin", calvin.PROTOCOL),
+        ("robosuite#robocasa", robocasa.protocol("OpenDrawer", "target")),
     ],
 )
 def test_a_benchmarks_page_states_the_protocol_that_is_recorded(page: str, protocol: BenchmarkProtocol) -> None:
-    text = (DOCS / "benchmarks" / f"{page}.md").read_text()
-    rows = dict(re.findall(r"^\| (\w+) \| (.*) \|$", text, re.MULTILINE))
+    rows = dict(re.findall(r"^\| (\w+) \| (.*) \|$", section("benchmarks", page), re.MULTILINE))
     assert re.match(r"\d+", rows["steps"]).group() == str(protocol.max_steps)  # type: ignore[union-attr]
     assert rows["rate"] == f"{protocol.control_hz:g} Hz"
     assert ("ends the episode" in rows["success"]) is protocol.ends_on_success
@@ -176,6 +177,7 @@ def test_every_page_stands_in_the_navigation_of_the_site() -> None:
     pages = {str(page.relative_to(DOCS)) for page in DOCS.rglob("*.md")}
     outside = {page.name for page in ROOT.glob("*.md")} | {"examples/README.md", "examples/experts/README.md"}
     assert pages == navigation - outside
+    assert len(pages) <= 60, "a reader looks for a subject: extend the page that has it"
 
 
 @pytest.mark.parametrize("page", [*ROOT.glob("*.md"), *DOCS.rglob("*.md")], ids=lambda page: page.name)

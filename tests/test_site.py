@@ -16,8 +16,8 @@ SITE = Path(__file__).parents[1] / "build" / "docs"
 PAGES = [
     "index.html",
     "tutorials/robot.html",
-    "reference/vlagents_ray.html",
-    "reference/policies.html",
+    "reference/index.html",
+    "reference/evaluate.html",
     "troubleshooting.html",
     "measured.html",
     "ARCHITECTURE.html",

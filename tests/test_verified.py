@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from collections import Counter
 from pathlib import Path
 from types import ModuleType
@@ -13,10 +14,12 @@ from tables import page_of
 
 from vlagents_ray.registry import POLICIES
 
+VERIFIED = verified.BEGIN.format(r"(\w+)")
+
 
 @pytest.mark.parametrize("family", verified.RUN_WITH)
 def test_a_familys_page_names_the_tests_that_there_are_with_what_became_of_them(family: str) -> None:
-    page = (verified.PAGES / f"{family}.md").read_text()
+    page = verified.page_of(family).read_text()
     assert verified.with_table(page, family) == page, "run `python tests/support/verified.py`"
 
 
@@ -33,8 +36,11 @@ def test_what_is_noted_is_of_tests_that_there_are(family: str) -> None:
 
 
 def test_each_family_with_a_page_is_listed() -> None:
+    shown = [name for page in verified.PAGES.glob("*.md") for name in re.findall(VERIFIED, page.read_text())]
+    assert sorted(shown) == sorted(verified.RUN_WITH)
     no_families = {page_of(name, one) for name, one in POLICIES.items() if not one.requirements} | {"index"}
-    assert set(verified.RUN_WITH) == {page.stem for page in verified.PAGES.glob("*.md")} - no_families
+    with_table = {verified.page_of(family).stem for family in shown}
+    assert with_table == {page.stem for page in verified.PAGES.glob("*.md")} - no_families
 
 
 def test_a_test_that_is_new_or_gone_changes_the_table(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

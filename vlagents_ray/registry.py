@@ -36,7 +36,7 @@ class Adapter:
     checkouts: tuple[str, ...] = ()  # variables, one of which names a checkout of the authors' code
     wants: str = ""  # further requirements of its users, such as "assets"
     tasks: str = "/<task>"  # of an environment: the pattern after its name
-    page: str | None = None  # below docs/policies or docs/benchmarks, "" for no page; None: the page with its name
+    page: str | None = None  # below docs/policies or docs/benchmarks, "page#section"; "": none; None: its own name
 
 
 POLICIES: dict[str, Adapter] = {
@@ -66,6 +66,7 @@ POLICIES: dict[str, Adapter] = {
         needs=("openpi", "jax", "flax", "transformers", "torch"),
         requirements=("openpi",),
         checkouts=("OPENPI_SRC",),
+        page="pi0#openpi",
     ),
     "openvla": Adapter(
         "vlagents_ray.policies.openvla.policy:OpenVLA",
@@ -88,6 +89,7 @@ POLICIES: dict[str, Adapter] = {
         needs=("octo", "jax", "flax", "transformers"),
         requirements=("octo",),
         checkouts=("OCTO_SRC",),
+        page="other#octo",
     ),
     "diffusion_policy": Adapter(
         "vlagents_ray.policies.diffusion_policy:DiffusionPolicy",
@@ -95,6 +97,7 @@ POLICIES: dict[str, Adapter] = {
         needs=("diffusion_policy", "torch", "diffusers", "dill", "omegaconf"),
         requirements=("diffusion_policy",),
         checkouts=("DIFFUSION_POLICY_SRC",),
+        page="other#diffusion-policy",
     ),
     "vjepa2_ac": Adapter(
         "vlagents_ray.policies.vjepa2_ac:VJepa2Ac",
@@ -102,6 +105,7 @@ POLICIES: dict[str, Adapter] = {
         needs=("src", "transformers", "torch", "timm"),
         requirements=("hf",),
         checkouts=("VJEPA2_SRC",),
+        page="other#v-jepa-2-ac",
     ),
     "onnx": Adapter(
         "vlagents_ray.policies.onnx:Onnx",
@@ -154,12 +158,14 @@ ENVS: dict[str, Adapter] = {
         "SIMPLER's Bridge twins",
         extra="maniskill",
         wants="assets",
+        page="maniskill#simpler",
     ),
     "metaworld": Adapter(
         "vlagents_ray.envs.metaworld:MetaWorld",
         "Meta-World's 50 tasks",
         needs=("metaworld",),
         extra="metaworld",
+        page="gymnasium#meta-world",
     ),
     "robosuite": Adapter(
         "vlagents_ray.envs.robosuite:Robosuite",
@@ -174,6 +180,7 @@ ENVS: dict[str, Adapter] = {
         requirements=("calvin",),
         wants="a checkout",
         tasks="/<scene>",
+        page="other#calvin",
     ),
     "robocasa": Adapter(
         "vlagents_ray.envs.robocasa:RoboCasa",
@@ -181,6 +188,7 @@ ENVS: dict[str, Adapter] = {
         needs=("robocasa",),
         requirements=("robocasa",),
         wants="assets",
+        page="robosuite#robocasa",
     ),
     "rcs": Adapter(
         "vlagents_ray.envs.rcs:Rcs",
@@ -189,6 +197,7 @@ ENVS: dict[str, Adapter] = {
         requirements=("rcs",),
         wants="assets",
         tasks="/pick",
+        page="other#rcs-and-duobench",
     ),
     "duobench": Adapter(
         "vlagents_ray.envs.rcs:DuoBench",
@@ -196,13 +205,14 @@ ENVS: dict[str, Adapter] = {
         needs=("duobench",),
         requirements=("rcs",),
         wants="assets",
-        page="rcs",
+        page="other#rcs-and-duobench",
     ),
     "aloha": Adapter(
         "vlagents_ray.envs.aloha:Aloha",
         "ALOHA's two simulated tasks, for two arms",
         needs=("gym_aloha", "dm_control"),
         extra="aloha",
+        page="gymnasium#aloha",
     ),
     "pusht": Adapter(
         "vlagents_ray.envs.gymnasium:PushT",
@@ -210,6 +220,7 @@ ENVS: dict[str, Adapter] = {
         needs=("gym_pusht", "shapely"),
         extra="pusht",
         tasks="",
+        page="gymnasium#pusht",
     ),
     "gymnasium": Adapter(
         "vlagents_ray.envs.gymnasium:Gymnasium",

@@ -1,4 +1,4 @@
-"""docs/cluster/ray.md, run as it is written on three hosts; and the files in cluster/ray."""
+"""docs/cluster/index.md, run as it is written on three hosts; and the files in cluster/ray."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from vlagents_ray.serve.launch.haproxy import ROBOTS, haproxy_binary, ingress_en
 
 ROOT = Path(__file__).parents[2]
 FILES = sorted((ROOT / "cluster" / "ray").glob("*.yaml"))
-PAGE = blocks((ROOT / "docs" / "cluster" / "ray.md").read_text())
+PAGE = blocks((ROOT / "docs" / "cluster" / "index.md").read_text())
 SCRIPT = ROOT / "cluster" / "ray" / "environment.sh"
 TIMEOUT_S = 240
 HAPROXY = "RAY_SERVE_HAPROXY_BINARY_PATH"

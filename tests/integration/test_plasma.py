@@ -151,7 +151,7 @@ print("Echo" in str(ray.util.list_named_actors(all_namespaces=True)))
 def test_a_ray_program_that_cannot_be_changed_joins_by_the_variables_of_the_docs(
     served: Server, tmp_path: Path
 ) -> None:
-    [line] = re.findall(r"`(RAY_ENABLE\S+=0) (RAY_AUTH_MODE=token)`", (ROOT / "docs" / "joining.md").read_text())
+    [line] = re.findall(r"`(RAY_ENABLE\S+=0) (RAY_AUTH_MODE=token)`", (ROOT / "docs" / "connecting.md").read_text())
     (tmp_path / "learner.py").write_text(UNCHANGED)
     this = {"RAY_ADDRESS": ray.get_runtime_context().gcs_address}  # others may run here, which "auto" may find first
     ran = of_the_user(tmp_path / "learner.py", served.url, **this, **dict(one.split("=") for one in line))

@@ -1,4 +1,4 @@
-"""docs/access.md is true: each cell of its table, tried on a replica with API keys and all its ways in."""
+"""docs/keys.md is true: each cell of its table, tried on a replica with API keys and all its ways in."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from dialect_server import ALL
 from vlagents_ray.protocol.messages import OPS
 from vlagents_ray.registry import DIALECTS
 
-PAGE = Path(__file__).parents[2] / "docs" / "access.md"
+PAGE = Path(__file__).parents[2] / "docs" / "keys.md"
 CREDENTIALS = 9
 
 
@@ -28,7 +28,7 @@ class Cell:
 def _cells() -> list[Cell]:
     rows = [
         [cell.strip() for cell in line.strip("|\n ").split("|")]
-        for line in PAGE.read_text().splitlines()
+        for line in PAGE.read_text().partition("\n## Access by key and endpoint\n")[2].splitlines()
         if line.startswith("|")
     ]
     (_, _, *credentials), _, *lines = rows
@@ -75,7 +75,7 @@ def test_the_table_names_every_way_in(replica: KeyedReplica) -> None:
     routes = {getattr(route, "path", "") for route in _routes(replica)}
     named = {way.strip("`").partition(" ")[2] for way in WAYS if way.startswith("`")}
     new = routes - {"/openapi.json"} - named - {f"/v1/{op}" for op in OPS}
-    assert not new, "WAYS of tests/support/api_key_replica.py tries them, docs/access.md has their cells"
+    assert not new, "WAYS of tests/support/api_key_replica.py tries them, docs/keys.md has their cells"
     with_ports = {"gr00t", "vlagents", "lerobot"}
     assert set(DIALECTS) == {*ALL, *with_ports}, "`keyed_replica` serves a new one, WAYS tries it"
 

@@ -188,7 +188,7 @@ FORM = (
     b'name="cameras.front"; filename="a"\r\n\r\n' + JPEG + b"\r\n--X--\r\n"
 )
 ACT = "`POST /v1/act`"  # for which the others reset a session first
-# Each way in by which something to decode comes, for a key; docs/access.md has them all.
+# Each way in by which something to decode comes, for a key; docs/keys.md has them all.
 CARRY = {way: attempt for way, attempt in WAYS.items() if way not in NOTHING_TO_DECODE | NO_KEY | {ACT}} | {
     f"{op}, {kind.partition(';')[0]}": _post(f"/v1/{op}", kind, content)
     for op in ("reset", "act")

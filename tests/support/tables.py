@@ -12,7 +12,7 @@ from collections.abc import Iterable, Iterator
 from pathlib import Path
 
 from programs import others, ran, settings
-from verified import marked, notes
+from verified import RUN_WITH, marked, notes
 
 from vlagents_ray.evaluate.results.statistics import wilson
 from vlagents_ray.registry import ENVS, POLICIES, Adapter
@@ -21,7 +21,6 @@ ROOT = Path(__file__).parents[2]
 RATES = json.loads((ROOT / "tests/rates.json").read_text())  # which the tests that it names find again
 LEARNT = json.loads((ROOT / "reference/checkpoint/rates.json").read_text())  # of the reference policy, by simulator
 WAYS = json.loads((ROOT / "reference/success.json").read_text())["ways"]  # of serving it, by `benchmarks.success`
-PLUGINS = ("arro",)  # pages among those of the policies, of packages in plugins/
 
 
 def _listed(adapters: dict[str, Adapter]) -> Iterator[tuple[str, Adapter]]:
@@ -41,6 +40,18 @@ def _code(words: Iterable[str]) -> str:
 def page_of(name: str, one: Adapter) -> str:
     """Return the name of an adapter's page; empty if it has none."""
     return name if one.page is None else one.page.partition("#")[0]
+
+
+def section(folder: str, page: str) -> str:
+    """Return the text of a page of docs/, given as `page` or, for one section of it, as `page#anchor`."""
+    name, _, anchor = page.partition("#")
+    text = (ROOT / "docs" / folder / f"{name}.md").read_text()
+    if not anchor:
+        return text
+    for part in re.split(r"^(?=## )", text, flags=re.MULTILINE):
+        if re.sub(r"[^\w-]", "", part.partition("\n")[0][3:].lower().replace(" ", "-")) == anchor:
+            return part
+    raise ValueError(f"docs/{folder}/{name}.md: got no heading of the second level for #{anchor}")
 
 
 def share(solved: int, episodes: int, digits: int = 0) -> str:
@@ -73,7 +84,7 @@ def policies(folder: str = "") -> Iterator[str]:
     yield from ("| policy | models | source | verified |", "|---|---|---|---|")
     for name, one in _listed(POLICIES):
         source = f"a checkout, {_code(one.checkouts)}" if one.checkouts else "PyPI"
-        said = verified(name, page_of(name, one))
+        said = verified(name, name if name in RUN_WITH else page_of(name, one))
         yield f"| {_link(name, f'`{name}`', one, folder)} | {one.about} | {one.wants or source} | {said} |"
 
 
@@ -134,8 +145,8 @@ TABLES: dict[str, dict[str, list[str]]] = {
 def with_tables(file: str, text: str) -> str:
     """Return the text of a page with its tables, or that of mkdocs.yml with the pages of the adapters."""
     if file == "mkdocs.yml":
-        for folder, adapters, more in (("policies", POLICIES, PLUGINS), ("benchmarks", ENVS, ())):
-            found = dict.fromkeys([*(page_of(name, one) for name, one in _listed(adapters)), *more])
+        for folder, adapters in (("policies", POLICIES), ("benchmarks", ENVS)):
+            found = dict.fromkeys(page_of(name, one) for name, one in _listed(adapters))
             pages = "".join(f"          - {folder}/{page}.md\n" for page in found if page)
             index = f"          - {folder}/index.md\n"
             text = re.sub(f"{index}(?:          - {folder}/.*\n)*", lambda _, new=index + pages: new, text)

@@ -22,13 +22,13 @@ from typing import Any
 
 import pytest
 
-from vlagents_ray.registry import families
+from vlagents_ray.registry import POLICIES, families
 
 ROOT = Path(__file__).parents[2]
 FAMILIES = ROOT / "tests" / "families"
 PAGES = ROOT / "docs" / "policies"
 PYTHON = "3.11"  # of this project's own environment
-BEGIN, END = "<!-- verified -->", "<!-- /verified -->"
+BEGIN, END = "<!-- verified: {} -->", "<!-- /verified -->"
 WHAT = {
     "parity": "acts as upstream's own code",
     "batches": "acts the same alone and in any batch",
@@ -36,11 +36,12 @@ WHAT = {
     "loading": "refuses what cannot be loaded",
     "size": "has the published size",
 }
-# Of each family with a page: the files in requirements/, and the packages and checkouts whose versions matter.
+PLUGINS = {"arro": "other#arro"}  # of packages in plugins/, with their place among the pages of the policies
+# Of each family: the files in requirements/, and the packages and checkouts whose versions matter.
 RUN_WITH = {
     name: (" ".join(one.requirements), (*one.checkouts, *one.needs[bool(one.checkouts) :]))
     for name, one in families()
-    if one.page is None
+    if (FAMILIES / name).is_dir()
 } | {"arro": ("hf", ("transformers", "torch"))}
 
 
@@ -132,14 +133,22 @@ def table(family: str) -> str:
 
 def with_table(page: str, family: str) -> str:
     """The text of a family's page with its table between the markers."""
-    if page.count(BEGIN) != 1 or page.count(END) != 1:
-        raise ValueError(f"docs/policies/{family}.md: want {BEGIN} and {END} once each, around its table")
-    return re.sub(f"{BEGIN}.*{END}", lambda _: f"{BEGIN}\n{table(family)}\n{END}", page, flags=re.DOTALL)
+    begin = BEGIN.format(family)
+    if page.count(begin) != 1:
+        raise ValueError(f"{page_of(family).name}: want {begin} once, and {END} after its table")
+    return re.sub(f"{begin}.*?{END}", lambda _: f"{begin}\n{table(family)}\n{END}", page, flags=re.DOTALL)
+
+
+def page_of(family: str) -> Path:
+    """The page that has a family's table."""
+    one = POLICIES.get(family)
+    name = (one.page if one else PLUGINS[family]) or family
+    return PAGES / f"{name.partition('#')[0]}.md"
 
 
 def main() -> None:
     for family in RUN_WITH:
-        file = PAGES / f"{family}.md"
+        file = page_of(family)
         file.write_text(with_table(file.read_text(), family))
 
 

@@ -1,7 +1,7 @@
 """RCS, the Robot Control Stack, in MuJoCo, and DuoBench, the benchmark for two arms that is built on it.
 
 Both need a separate Python environment, requirements/rcs.txt: their packages conflict with the simulators of this
-package's extras, and RCS is AGPL-3. See docs/benchmarks/rcs.md.
+package's extras, and RCS is AGPL-3. See docs/benchmarks/other.md.
 """
 
 from __future__ import annotations

@@ -83,7 +83,7 @@ def joined(address: str | None = None, **options: Any) -> Iterator[None]:
         except (ConnectionError, ray.exceptions.AuthenticationError) as error:
             raise ConfigError(
                 f"cannot connect to a Ray cluster at {where!r}: {error}. Start Ray on this machine, or join it to a "
-                f"cluster (`ray start`); the page docs/cluster/ray.md shows how"
+                f"cluster (`ray start`); the page docs/cluster/index.md shows how"
             ) from error
         stack.push(unless_lost(leave_ray))
         yield

@@ -133,8 +133,8 @@ def test_other_settings_are_refused(args: dict[str, Any]) -> None:
 
 
 def test_the_deployment_of_the_page_about_it_is_accepted() -> None:
-    page = Path(__file__).parents[3] / "docs" / "cluster" / "autoscaling.md"
-    [block] = re.findall(r"```yaml\n(.*?)```", page.read_text(), re.DOTALL)
+    page = Path(__file__).parents[3] / "docs" / "cluster" / "scaling.md"
+    [block] = re.findall(r"```yaml\n(applications:.*?)```", page.read_text(), re.DOTALL)
     [application] = yaml.safe_load(block)["applications"]
     args = ServerArgs(**application["args"])
     assert args.autoscaling.min_replicas == 0

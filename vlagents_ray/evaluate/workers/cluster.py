@@ -77,7 +77,7 @@ def unused_gpus(cell: EvalCase, where: WorkerInfo) -> str | None:
         return None
     return (
         f"{cell.env} draws on {where.renderer}, as its workers have no GPU; the cluster has {gpus:g}: {SHARE}, "
-        f"see docs/cluster/placement.md"
+        f"see docs/cluster/scaling.md"
     )
 
 
