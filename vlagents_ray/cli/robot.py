@@ -108,7 +108,8 @@ def _run(options: argparse.Namespace) -> LoopReport:
     say: Callable[[str], None] = lambda line: print(line, flush=True)  # noqa: E731, T201
     hz = options.hz or _HZ
     deadline_s = 0.0 if options.mode == "async" else WAIT_S
-    deadline_s = deadline_s if options.deadline_ms is None else options.deadline_ms / 1e3
+    if options.deadline_ms is not None:
+        deadline_s = options.deadline_ms / 1e3
     make_robot = robot_named("--robot", options.robot, options.robot_set) if options.robot else None
     make_leader = import_class("--leader", options.leader) if ":" in (options.leader or "") else None
     with contextlib.ExitStack() as stack:
@@ -134,8 +135,9 @@ def _run(options: argparse.Namespace) -> LoopReport:
         if topics is not None or make_robot is not None or options.trained_on is not None:
             require_match(contract, contract_of(robot))
             _require_fit(options, agent, robot, guard.limits, say)
-        opened = Recorder(options.record, hz, interventions=leader is not None) if options.record else None
-        recorder = None if opened is None else stack.enter_context(opened)
+        recorder = None
+        if options.record:
+            recorder = stack.enter_context(Recorder(options.record, hz, interventions=leader is not None))
         viewer = None if options.rerun is None else stack.enter_context(open_viewer(options.rerun))
         hangs_s = max(0.2, 5 / hz) + deadline_s
 

@@ -96,8 +96,8 @@ class RobotRun:
             env = stack.enter_context(make_env(self.options.env, **self._env_options))
             hz = self.options.hz or env.contract.control_hz or _HZ
             leader = self._leader(env.contract, stack)
-            motion = {name: getattr(self.options, name) for name in ("max_step", "limits", "soft_start_s")}
-            guard = Guard(env.contract, hz=hz, **motion)
+            limits, soft_start_s = self.options.limits, self.options.soft_start_s
+            guard = Guard(env.contract, max_step=self.options.max_step, limits=limits, hz=hz, soft_start_s=soft_start_s)
             agent = stack.enter_context(self._agent(env.contract, leader, guard))
             self._control = agent.control
             if self.options.record is not None:

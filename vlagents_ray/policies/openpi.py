@@ -555,7 +555,10 @@ class OpenPi(ModelPolicy):
         ours = self.config
         robot = choose_robot(config.name, transforms.robot, ours.cameras, ours.state, ours.layout)
         found = attempt(transforms.ranges, robot)  # a transform of the user's own may want more of an observation
-        self.statistics = None if isinstance(found, Exception) else found
+        if isinstance(found, Exception):
+            logger.warning("the statistics of the training are not stated: %s: %s", type(found).__name__, found)
+            found = None
+        self.statistics = found
         if (folder / "model.safetensors").is_file():
             model = load_torch(config, folder, self.config, self.compilation)
         elif (folder / "params").is_dir():

@@ -77,7 +77,7 @@ class Limits:
             ) from error
 
     def bounds(self, dim: int) -> tuple[np.ndarray, np.ndarray]:
-        """Return `low` and `high`, (dim,) each; infinite if there is none, or for another number of joints."""
+        """Return `low` and `high`, (dim,) each; infinite where none is set, and for another number of joints."""
         ends, fitting = ((self.low, -np.inf), (self.high, np.inf)), ((), (dim,))
         low, high = (
             np.broadcast_to(one if one is not None and np.shape(one) in fitting else free, dim) for one, free in ends

@@ -229,9 +229,7 @@ class WorkerPool(Workers):
         if monotonic() < self._unreachable.get(host, 0.0) or not self._head.answers():
             return failure
         sleep(SIGNAL_S)
-        if (
-            head_is_gone()
-        ):  # Slurm signals all of a job at once; Ray's calls would now block until it kills this process
+        if head_is_gone():  # Slurm signals all of a job at once; Ray's calls would block until it kills this process
             return failure
         try:
             return replace(failure, log=tail_at(host, worker.process["logs"]))
