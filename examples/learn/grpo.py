@@ -13,21 +13,23 @@ from token_student import TokenNetwork, tokens_of
 _EPSILON = 1e-6  # beside the standard deviation of a group
 
 
-def group_advantages(columns: Mapping[str, np.ndarray]) -> np.ndarray:
+def group_advantages(columns: Mapping[str, np.ndarray], discount: float = 1.0) -> np.ndarray:
     """Return the advantages of the actions by the groups of episodes from one start state, (T,) float32.
 
-    An episode's reward is 1 if the task was solved at any step. Each of its actions has the advantage (reward - mean of
-    the group) / (standard deviation of the group + 1e-6) (GRPO, arXiv 2402.03300). It is 0 after the task was solved,
-    and in groups with all or no episodes solved (DAPO, arXiv 2503.14476).
+    An episode's reward is 1 if the task was solved at any step, times the discount for each step before that one. Each
+    of its actions has the advantage (reward - mean of the group) / (standard deviation of the group + 1e-6) (GRPO,
+    arXiv 2402.03300). It is 0 after the task was solved, and in groups of equal rewards (DAPO, arXiv 2503.14476).
     """
     starts, lengths = episodes(columns)
-    solved = np.logical_or.reduceat(columns["success"], starts).astype(np.float64)
+    kept = until_solved(columns)
+    solved = np.logical_or.reduceat(columns["success"], starts)
+    reward = solved * discount ** (np.add.reduceat(kept.astype(np.float64), starts) - 1)
     group = columns["episode"][starts]
     gain = np.zeros(len(starts))
     for number in np.unique(group):
         members = group == number
-        gain[members] = (solved[members] - solved[members].mean()) / (solved[members].std() + _EPSILON)
-    return np.where(until_solved(columns), np.repeat(gain, lengths), 0.0).astype(np.float32)
+        gain[members] = (reward[members] - reward[members].mean()) / (reward[members].std() + _EPSILON)
+    return np.where(kept, np.repeat(gain, lengths), 0.0).astype(np.float32)
 
 
 class GRPOLearner(NetworkLearner):

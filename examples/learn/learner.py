@@ -85,7 +85,7 @@ def until_solved(columns: Mapping[str, np.ndarray]) -> np.ndarray:
     return kept
 
 
-def advantages(columns: Mapping[str, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
+def advantages(columns: Mapping[str, np.ndarray], discount: float = DISCOUNT) -> tuple[np.ndarray, np.ndarray]:
     """Return the advantages of the actions, and the targets of the values, each (T,) float32.
 
     The reward is 1 for the step that solves the task, which ends the episode here; both are 0 after it. An episode that
@@ -98,7 +98,7 @@ def advantages(columns: Mapping[str, np.ndarray]) -> tuple[np.ndarray, np.ndarra
         last = i + 1 == len(value) or columns["t"][i + 1] == 0
         if last or success[i]:
             following, later = (0.0 if success[i] else float(value[i])), 0.0
-        later = float(success[i]) + DISCOUNT * following - float(value[i]) + DISCOUNT * TRACE * later
+        later = float(success[i]) + discount * following - float(value[i]) + discount * TRACE * later
         gain[i], following = later, float(value[i])
     return gain, np.where(kept, gain + value, 0.0).astype(np.float32)
 

@@ -72,12 +72,12 @@ class LocalAgent(Agent):
     """One session of an engine in this process."""
 
     def __init__(self, engine: Engine) -> None:
-        self._engine = engine
+        self.engine = engine
         self._session = uuid.uuid4().hex
 
     @property
     def contract(self) -> Contract | None:
-        return self._engine.contract
+        return self.engine.contract
 
     def reset(
         self, obs: Obs, instruction: str | None, *, contract: dict[str, Any] | None = None, **kwargs: Any
@@ -102,18 +102,18 @@ class LocalAgent(Agent):
     def _replies(self, sessions: Sequence[Any], requests: Sequence[Request]) -> list[Reply]:
         """Return the reply to one request of each session."""
         answers: list[Future[Reply]] = [Future() for _ in requests]
-        self._engine.submit(
+        self.engine.submit(
             [
                 PendingRequest(session._session, request, answer.set_result, Rank.SIMULATION)
                 for session, request, answer in zip(sessions, requests, answers, strict=True)
             ]
         )
-        while not self._engine.threaded and not all(answer.done() for answer in answers):
-            if (taken := self._engine.queue.take()) is None:
+        while not self.engine.threaded and not all(answer.done() for answer in answers):
+            if (taken := self.engine.queue.take()) is None:
                 break
-            self._engine.run(taken)
+            self.engine.run(taken)
             if not taken.batch:
-                self._engine.queue.poller.poll(_LOOK_S)
+                self.engine.queue.poller.poll(_LOOK_S)
         return [answer.result() for answer in answers]
 
 
@@ -136,14 +136,14 @@ class LocalPolicy(LocalAgent):
     @property
     def metadata(self) -> dict[str, Any]:
         """The metadata of the policy, as `RemoteAgent.metadata`."""
-        return policy_metadata(self._args, self._engine, *self._code)
+        return policy_metadata(self._args, self.engine, *self._code)
 
     def initialize(self) -> None:
-        self._engine.start(threaded=self._threaded)
+        self.engine.start(threaded=self._threaded)
 
     def sessions(self, n: int) -> list[LocalAgent]:
         """Open `n` more sessions, for `act_batch` of this agent; close each of them."""
-        return [LocalAgent(self._engine) for _ in range(n)]
+        return [LocalAgent(self.engine) for _ in range(n)]
 
     def close(self) -> None:
-        self._engine.close()
+        self.engine.close()

@@ -1,0 +1,316 @@
+"""The reference policy, which acts by flow matching, becomes faster by reinforcement learning from pixels.
+
+    python examples/learn/flow.py learn grpo --out runs/grpo-0
+    python examples/learn/flow.py learn ppo --seed 1 --out runs/ppo-1
+    python examples/learn/flow.py compare runs/grpo-0 runs/grpo-1
+
+An action of the learner is an action chunk, with the log-probability of its random steps (Flow-SDE). Policy, rollouts
+and learner share this process, without Ray; with --max-lag the policy is served, and a worker plays while the learner
+learns. docs/tutorials/learn.md explains it. It needs torch, pyarrow and a checkout.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import shutil
+import time
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Annotated, Any, Literal, NamedTuple, get_args
+
+import numpy as np
+import pyarrow as pa
+import torch
+import typer
+from grpo import group_advantages
+from learner import advantages, episodes, until_solved
+from pydantic import BaseModel, ConfigDict, NonNegativeInt, PositiveInt
+
+from vlagents_ray import Obs
+from vlagents_ray.cli.console import errors
+from vlagents_ray.cli.ray_session import quiet_ray
+from vlagents_ray.evaluate import EvalConfig, Results, compare
+from vlagents_ray.learn import Publisher, RolloutPlan, Rollouts, TrainingEvaluation, answers, arrays, log_ratio
+from vlagents_ray.policies.base.model_inputs import state_vector
+from vlagents_ray.policies.flow import logprob_of_chain
+from vlagents_ray.policies.reference import Reference
+from vlagents_ray.policies.reference.checkpoint import (
+    CAMERAS,
+    CONFIG,
+    WEIGHTS,
+    normalised,
+    pixels,
+    read_checkpoint,
+)
+from vlagents_ray.policies.reference.network import read_network
+from vlagents_ray.serve.config.deployment import ServerArgs
+from vlagents_ray.serve.launch.deployment_file import deployment, together
+from vlagents_ray.serve.launch.server import running_server
+from vlagents_ray.serve.local_agent import LocalPolicy
+from vlagents_ray.weights.safetensors import write_values
+
+CHECKPOINT = Path(__file__).parents[2] / "reference" / "checkpoint"
+ENV = ROBOT = "tabletop"
+ENV_OPTIONS: dict[str, Any] = {"cameras": ["front", "wrist"], "width": 64, "height": 64}
+EXECUTE = 4  # rows of a chunk
+TICKS = 40  # of an episode of the training; with fewer, too few are solved at first
+NUM_ENVS = 64  # that act in one batch
+SHORT, LONG = 32, 80  # ticks of the evaluations: the policy is to become faster, and to stay as reliable
+TRAINING = 20_000_000  # first seed of the training's episodes; those of the evaluations begin at 0
+HEAD = ("noisy", "when", "why", "blocks", "result")  # the flow's modules, which alone are trained, as in πRL
+NOISE = 0.6  # of the random steps; larger deviations change the reward by more, and so say more
+DISCOUNT = 0.96  # per tick
+CLIP = 0.2  # of PPO's ratio (arXiv 1707.06347)
+BATCH = 1024  # acts
+RATE, VALUE_RATE = 2e-4, 1e-3  # of AdamW, for the flow and for the value
+
+Method = Literal["grpo", "ppo"]
+app = typer.Typer(pretty_exceptions_enable=False)
+
+
+class FlowPlan(BaseModel):
+    """The settings of a run."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    method: Method
+    out: Path
+    seed: NonNegativeInt = 0
+    iterations: PositiveInt = 20
+    episodes: PositiveInt = 512  # of an iteration
+    groups: PositiveInt = 8  # episodes from one start state, in "grpo"
+    epochs: PositiveInt = 2  # times that an iteration learns from each act
+    max_lag: NonNegativeInt | None = None  # versions; None: episodes and learner wait for each other
+    evaluate_every: PositiveInt = 5  # iterations
+    held_out: PositiveInt = 500  # episodes of an evaluation, the same for each version
+
+
+class Learned(NamedTuple):
+    """What a learner reports of an iteration."""
+
+    acts: int  # with an advantage
+    clipped: float  # share of their rows
+    log_ratio: float  # standard deviation before the first step, nats; 0 if learner and policy agree
+
+
+class FlowLearner:
+    """Trains the flow of the reference network by GRPO or PPO; what it sees and reads stays as it is."""
+
+    def __init__(self, method: Method, seed: int, epochs: int) -> None:
+        torch.manual_seed(seed)
+        self._method, self._epochs, self._rng = method, epochs, np.random.default_rng(seed)
+        self._checkpoint = read_checkpoint(CHECKPOINT)
+        self.network = read_network(self._checkpoint.sizes, CHECKPOINT)
+        self._trained = {n: v for n, v in self.network.named_parameters() if n.partition(".")[0] in HEAD}
+        width = 2 * self._checkpoint.sizes.head
+        self._value = torch.nn.Sequential(
+            torch.nn.LayerNorm(width), torch.nn.Linear(width, 128), torch.nn.SiLU(), torch.nn.Linear(128, 1)
+        )
+        flow, value = list(self._trained.values()), list(self._value.parameters())
+        groups = [{"params": flow, "lr": RATE}, {"params": value, "lr": VALUE_RATE}]
+        self._optimizer = torch.optim.AdamW(groups, betas=(0.9, 0.99), weight_decay=0.0)
+        self.steps = 0  # of the optimizer
+
+    def state(self) -> dict[str, torch.Tensor]:
+        """Return the trained values by name, for a partial push."""
+        return {name: value.detach() for name, value in self._trained.items()}
+
+    def improve(self, columns: Mapping[str, np.ndarray]) -> Learned:
+        """Take steps of the optimizer on whole episodes.
+
+        Args:
+            columns: The transitions, with `logprob` and `replay.chain`; each act has EXECUTE of them.
+        """
+        contexts, chains = self._contexts(columns), torch.from_numpy(columns["replay.chain"].copy())
+        stated = torch.from_numpy(columns["logprob"].reshape(-1, EXECUTE).copy())
+        gain, targets = self._advantages(columns, contexts)
+        rows, clipped, first = np.flatnonzero(gain.any(1)), list[float](), 0.0
+        for _ in range(self._epochs):
+            order = self._rng.permutation(rows)
+            for number in np.array_split(order, max(1, round(len(order) / BATCH))) if len(rows) else ():
+                batch = torch.from_numpy(number)
+                logprob = self._logprob(contexts[batch], chains[batch])
+                first = first or log_ratio(logprob.detach(), stated[batch]).std
+                ratio, part = (logprob - stated[batch]).exp(), gain[batch]
+                loss = -torch.minimum(ratio * part, ratio.clamp(1 - CLIP, 1 + CLIP) * part).mean()
+                if targets is not None:
+                    loss = loss + (self._value(contexts[batch]).squeeze(-1) - targets[batch]).square().mean()
+                clipped.append(float(((ratio - 1).abs() > CLIP).float().mean()))
+                self._optimizer.zero_grad()
+                loss.backward()
+                torch.nn.utils.clip_grad_norm_(self._trained.values(), 1.0)
+                self._optimizer.step()
+                self.steps += 1
+        return Learned(len(rows), float(np.mean(clipped or [0.0])), first)
+
+    def _advantages(
+        self, columns: Mapping[str, np.ndarray], contexts: torch.Tensor
+    ) -> tuple[torch.Tensor, torch.Tensor | None]:
+        """Return the advantages of the rows of acts, (A, EXECUTE), and for PPO the targets of their values, (A,)."""
+        if self._method == "grpo":
+            return torch.from_numpy(group_advantages(columns, DISCOUNT).reshape(-1, EXECUTE)), None
+        rows = first_rows(columns)
+        with torch.no_grad():
+            value = self._value(contexts).squeeze(-1).numpy()
+        success = np.logical_or.reduceat(columns["success"], rows)
+        each, targets = advantages({"t": columns["t"][rows], "success": success, "value": value}, DISCOUNT**EXECUTE)
+        kept = until_solved(columns).reshape(-1, EXECUTE)
+        before = kept.any(1)
+        gain = kept * ((each - each[before].mean()) / (each[before].std() + 1e-6))[:, None]
+        return torch.from_numpy(gain.astype(np.float32)), torch.from_numpy(targets)
+
+    def _logprob(self, contexts: torch.Tensor, chains: torch.Tensor) -> torch.Tensor:
+        """Return the log-probabilities of the executed rows of acts, (B, EXECUTE), nats."""
+        ones = torch.ones(len(contexts))
+        found = logprob_of_chain(lambda a, time: self.network.velocity(contexts, a, time * ones), chains, NOISE)
+        summed: torch.Tensor = found[:, :EXECUTE].sum(2)
+        return summed
+
+    def _contexts(self, columns: Mapping[str, np.ndarray]) -> torch.Tensor:
+        """Return what the flow gets of images, state and words at each act, (A, C)."""
+        rows, robot, found = first_rows(columns), self._checkpoint.embodiments[ROBOT], list[torch.Tensor]()
+        tokens = {text: self._checkpoint.tokens(text) for text in set(columns["instruction"])}
+        parts = [name.removeprefix("state.") for name in columns if name.startswith("state.")]
+        for some in np.array_split(rows, max(1, len(rows) // 64)):  # so many images stay in the cache
+            obs = [Obs({}, float(columns["gripper"][i]), {p: columns[f"state.{p}"][i] for p in parts}) for i in some]
+            state = normalised(robot, np.stack([state_vector(o, robot.state) for o in obs]), 8)
+            images = [torch.from_numpy(columns[f"cameras.{robot.cameras[name]}"][some]) for name in CAMERAS]
+            words = torch.from_numpy(np.stack([tokens[columns["instruction"][i]] for i in some]))
+            seen = pixels(torch.stack(images, 1)).unbind(1)
+            with torch.no_grad():
+                found.append(self.network.encode(words, torch.from_numpy(state), *seen))
+        return torch.cat(found)
+
+
+def first_rows(columns: Mapping[str, np.ndarray]) -> np.ndarray:
+    """Return the first transition of each act, (A,) int64."""
+    rows: np.ndarray = np.flatnonzero(np.diff(answers(columns), prepend=-1))
+    return rows
+
+
+class FlowRun:
+    """A run: episodes, the learner, a push, and now and then an evaluation."""
+
+    def __init__(self, plan: FlowPlan) -> None:
+        self._plan, self._learner = plan, FlowLearner(plan.method, plan.seed, plan.epochs)
+        self._config = {"checkpoint": str(CHECKPOINT), "embodiment": ROBOT, "execute": EXECUTE, "noise_level": NOISE}
+        self._evaluated = Reference.from_config(self._config)
+        self._evaluated.initialize()
+
+    def learn(self) -> None:
+        """Learn; the results are in the plan's folder, and the new checkpoint in its folder `checkpoint`."""
+        plan, learner = self._plan, self._learner
+        curve, whole = self._evaluation(SHORT), self._evaluation(LONG)
+        self._play(whole)
+        with self._policy() as (target, acting), Publisher(target) as weights, self._rollouts(acting) as rollouts:
+            for iteration in range(plan.iterations):
+                if iteration % plan.evaluate_every == 0:
+                    self._play(curve)
+                begun = time.monotonic()
+                columns = arrays(self._episodes(rollouts))
+                solved = np.logical_or.reduceat(columns["success"], episodes(columns)[0]).mean()
+                played = time.monotonic()
+                learned = learner.improve(columns)
+                rollouts.version = weights.push(learner.state(), partial=True, version=learner.steps)
+                print(
+                    f"iteration {iteration + 1}: {solved:.1%} of {plan.episodes} episodes solved, {played - begun:.1f} "
+                    f"s; {learned.acts} acts, {learned.clipped:.0%} clipped, log ratio {learned.log_ratio:.1g}, "
+                    f"{time.monotonic() - played:.1f} s; {rollouts.stats.stale} stale episodes"
+                )
+        self._play(curve)
+        self._play(whole)
+        self._save(plan.out / "checkpoint")
+
+    def _episodes(self, rollouts: Rollouts) -> Any:
+        if self._plan.max_lag is None:
+            return rollouts.collect(self._plan.episodes)
+        return pa.Table.from_batches([next(rollouts) for _ in range(self._plan.episodes)])
+
+    def _evaluation(self, ticks: int) -> TrainingEvaluation:
+        plan, options = self._plan, ENV_OPTIONS | {"max_steps": ticks}
+        suite = {"envs": [ENV], "env_options": options, "episodes": plan.held_out, "num_envs": 16}
+        settings = {"policies": [{"name": plan.method, "execute": EXECUTE}], "suites": [suite], "workers": 0}
+        config = EvalConfig.model_validate(settings | {"out": plan.out / f"within_{ticks}", "video": "none"})
+        return TrainingEvaluation(self._evaluated, config)
+
+    def _play(self, evaluation: TrainingEvaluation) -> None:
+        self._evaluated.load_parameters(self._evaluated.parameters() | self._learner.state())
+        newest = evaluation.play(self._learner.steps).totals[-1]
+        print(f"{newest.contender}: {newest.success_once.rate:.1%} of {self._plan.held_out} held-out episodes solved")
+
+    @contextlib.contextmanager
+    def _policy(self) -> Iterator[tuple[Any, Any]]:
+        """Yield the target of pushes, and the policy of a `RolloutPlan`."""
+        args = {"config": self._config, "batch": {"max_size": NUM_ENVS}}
+        if self._plan.max_lag is None:
+            policy = LocalPolicy(ServerArgs.model_validate(args | {"policy": "reference"}), self._config)
+            yield policy.engine, lambda: policy
+        else:
+            served = together({"flow": deployment("reference", **args)})
+            with quiet_ray(None), running_server(served, ingress=False):
+                yield "serve://flow", "serve://flow"
+
+    def _rollouts(self, policy: Any) -> Rollouts:
+        plan = self._plan
+        return Rollouts(
+            RolloutPlan(
+                ENV,
+                policy,
+                workers=0 if plan.max_lag is None else 1,
+                num_envs=NUM_ENVS,
+                groups=plan.groups if plan.method == "grpo" else 1,
+                want=("logprob", "replay"),
+                max_lag=plan.max_lag,
+                seed=TRAINING * (1 + plan.seed),
+                env_options=ENV_OPTIONS | {"max_steps": TICKS},
+                execute=EXECUTE,
+            )
+        )
+
+    def _save(self, folder: Path) -> None:
+        folder.mkdir(parents=True, exist_ok=True)
+        shutil.copy(CHECKPOINT / CONFIG, folder)
+        with (folder / WEIGHTS).open("wb") as file:
+            write_values(file, {name: value.numpy() for name, value in self._learner.network.state_dict().items()})
+
+
+@app.command()
+def learn(
+    method: Annotated[str, typer.Argument(help=f"One of {', '.join(get_args(Method))}.")],
+    out: Annotated[Path, typer.Option(help="New folder of the results.")],
+    seed: Annotated[int, typer.Option(help="Of the training's episodes.")] = 0,
+    iterations: Annotated[int, typer.Option(help="Of 512 episodes each.")] = 20,
+    max_lag: Annotated[
+        int | None, typer.Option(help="Play while learning, with weights so many versions old.", show_default=False)
+    ] = None,
+) -> None:
+    """Improve the reference policy from pixels, by the reward of the environment alone."""
+    torch.set_num_threads(1)  # its networks are small
+    settings = {"method": method, "out": out, "seed": seed, "iterations": iterations, "max_lag": max_lag}
+    with errors():
+        FlowRun(FlowPlan.model_validate(settings)).learn()
+
+
+@app.command("compare")
+def compare_runs(folders: Annotated[list[Path], typer.Argument(help="Of runs with different seeds.")]) -> None:
+    """Compare each run's first and last version on the same seeds, by McNemar's exact test."""
+    with errors():
+        for ticks in (SHORT, LONG):
+            gains = []
+            for folder in folders:
+                results = Results.load(folder / f"within_{ticks}")
+                versions = sorted(results.contenders, key=lambda name: int(name.partition("@")[2]))
+                total = compare(results, versions[-1], versions[0]).total
+                pairs = total.pairs
+                before, after = (pairs.both + pairs.only_b, pairs.both + pairs.only_a)
+                gains.append(pairs.difference)
+                print(
+                    f"{folder}, within {ticks} ticks: {before / pairs.total:.1%} before, {after / pairs.total:.1%} "
+                    f"after, of {pairs.total}; p {pairs.p_value:.2g}"
+                )
+            if len(gains) > 1:
+                print(f"gain: {np.mean(gains):+.1%}, standard deviation {np.std(gains, ddof=1):.1%} of runs")
+
+
+if __name__ == "__main__":
+    app()
