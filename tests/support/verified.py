@@ -105,28 +105,22 @@ def table(family: str) -> str:
     """The table of a family's page, in Markdown."""
     requirements, _ = RUN_WITH[family]
     noted = [one for one in notes(family) if one["tests"]]
-    ran = (
-        "They have not been run for this table."
-        if not noted
-        else f"They ran with {'; and with '.join(map(_with, noted))}."
-    )
+    ran = f"They ran with {'; and with '.join(map(_with, noted))}." if noted else "They have not run yet."
     groups: dict[tuple[str, str], list[str]] = {}  # tests by what they verify and by their file
     for name, what in sorted(marked(family), key=lambda one: list(WHAT).index(one[1])):
         groups.setdefault((what, name.partition("::")[0]), []).append(name)
-    rows = [
-        f"| {WHAT[what]} | `{file}` | {' | '.join(_result(one, names) for one in noted) or 'not run'} |"
-        for (what, file), names in groups.items()
-    ]
+    rows, seen = list[str](), set[str]()
+    for (what, file), names in groups.items():
+        cells = [_reason_once(_result(one, names), seen) for one in noted] or ["not run"]
+        rows.append(f"| {WHAT[what]} | `{file}` | {' | '.join(cells)} |")
     cases = [f"cases, Python {one['python']}" for one in noted] if len(noted) > 1 else ["cases"]
     return "\n".join(
         [
-            f"These tests of `tests/families/{family}` use small random checkpoints. {ran}",
+            f"`make verified FAMILIES={_quoted(requirements)}` runs these tests with small random checkpoints. {ran}",
             "",
-            f"| the policy … | tests in | {' | '.join(cases)} |",
+            f"| the policy … | `tests/families/{family}` | {' | '.join(cases)} |",
             f"|---|---{'|---' * len(cases)}|",
             *rows,
-            "",
-            f"`make verified FAMILIES={_quoted(requirements)}` runs them, and writes this table.",
         ]
     )
 
@@ -175,6 +169,15 @@ def _result(noted: dict[str, Any], names: list[str]) -> str:
     files = (name.partition("::")[0] for name in names if name not in ran)
     not_run = _once(noted.get("left_out", {}).get(file, "it is newer than these results") for file in files)
     return "; ".join(filter(None, (said, not_run and f"not run: {not_run}")))
+
+
+def _reason_once(result: str, seen: set[str]) -> str:
+    """Return a cell, without its reason if `seen`, to which it is added, has that."""
+    outcome, _, reason = result.partition(": ")
+    if reason in seen:
+        return outcome
+    seen.add(reason)
+    return result
 
 
 def _once(reasons: Iterable[str]) -> str:
