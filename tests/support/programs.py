@@ -74,14 +74,14 @@ _G1 = {
 _POSE = {name: {"start": i, "stop": i + 1} for i, name in enumerate(("x", "y", "z", "roll", "pitch", "yaw", "gripper"))}
 
 PROGRAMS = {
-    "openpi-client": Program(("openpi-client",), "openpi", said="0.1.2 needs `typing_extensions` besides"),
+    "openpi-client": Program(("openpi-client",), "openpi", said="0.1.2 also needs `typing_extensions`"),
     "openpi examples/simple_client": Program(
         ("OPENPI_SRC", "openpi-client"), "openpi", "GitHub", "a preset for each `--env`; only applications at the root",
         requirements=_OPENPI,
     ),
     "openpi examples/aloha_sim": Program(("OPENPI_SRC", "openpi-client"), "openpi", "GitHub", requirements=_OPENPI),
     "RoboArena's messages": Program(
-        ("openpi-client",), "roboarena", said="openpi's client with RoboArena's requests, as theirs is on no index"
+        ("openpi-client",), "roboarena", said="openpi's client with RoboArena's requests; theirs is on no index"
     ),
     "OpenVLA's `requests` and json-numpy": Program(("json-numpy",), "openvla"),
     "vla-eval": Program(("vla-eval",), "vla_eval", said="`server.url` ends in `/vla-eval`"),
@@ -169,11 +169,11 @@ PROGRAMS = {
 # Programs with a protocol of their own: what they speak, and the size of a dialect, estimated by those that there are.
 OTHERS = {
     "positronic 0.4.1, `RemotePolicy`": "sessions over WebSocket and gRPC (`/api/v1/session`): about 350 lines",
-    "inspect-robots-xpolicylab 0.1.0": "XPolicyLab's frames, whose servers `upstream` asks: about 250 lines",
-    "strands-robots 0.5.3, `RemotePolicy`": "JSON texts over WebSocket: about 250 lines",
-    "atoms-robot 0.1.0": "`POST /v1/act` with JPEG in base64, at a path that is ours: about 100 lines, and a port",
+    "inspect-robots-xpolicylab 0.1.0": "XPolicyLab's frames: about 250 lines",
+    "strands-robots 0.5.3, `RemotePolicy`": "JSON over WebSocket: about 250 lines",
+    "atoms-robot 0.1.0": "`POST /v1/act` with JPEG in base64, at a path of this project: about 100 lines, and a port",
     "roboeval 0.1.1": "HTTP with a handshake that states formats of actions: about 150 lines",
-    "agi-diy 0.5.12": "leases of a hosted service with its own accounts: none",
+    "agi-diy 0.5.12": "leases of a hosted service with accounts: no dialect",
 }
 
 
