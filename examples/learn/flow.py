@@ -279,16 +279,18 @@ def learn(
     method: Annotated[str, typer.Argument(help=f"One of {', '.join(get_args(Method))}.")],
     out: Annotated[Path, typer.Option(help="New folder of the results.")],
     seed: Annotated[int, typer.Option(help="Of the training's episodes.")] = 0,
-    iterations: Annotated[int, typer.Option(help="Of 512 episodes each.")] = 20,
+    iterations: Annotated[int, typer.Option(min=1)] = 20,
+    episodes: Annotated[int, typer.Option(min=1, help="Of an iteration.")] = 512,
+    held_out: Annotated[int, typer.Option(min=1, help="Episodes of an evaluation.")] = 500,
     max_lag: Annotated[
-        int | None, typer.Option(help="Play while learning, with weights so many versions old.", show_default=False)
+        int | None, typer.Option(min=0, help="Play while learning, with weights at most so many versions old.")
     ] = None,
 ) -> None:
     """Improve the reference policy from pixels, by the reward of the environment alone."""
     torch.set_num_threads(1)  # its networks are small
-    settings = {"method": method, "out": out, "seed": seed, "iterations": iterations, "max_lag": max_lag}
+    settings = {"seed": seed, "iterations": iterations, "episodes": episodes, "held_out": held_out, "max_lag": max_lag}
     with errors():
-        FlowRun(FlowPlan.model_validate(settings)).learn()
+        FlowRun(FlowPlan.model_validate(settings | {"method": method, "out": out})).learn()
 
 
 @app.command("compare")

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import os
+import subprocess
+import sys
 from pathlib import Path
 from typing import Any, get_args
 
@@ -10,6 +13,7 @@ import numpy as np
 import pytest
 from flow import EXECUTE, HEAD, FlowLearner, FlowPlan, FlowRun, Method
 from grpo import group_advantages
+from ray_processes import processes, ray_folder
 
 from vlagents_ray.evaluate import Results
 from vlagents_ray.policies.reference.network import read_network
@@ -84,3 +88,23 @@ def test_a_learners_step_makes_good_acts_likelier(tmp_path: Path) -> None:
         rise = (learner._logprob(contexts, chains) - before).sum(1).numpy()
     acts = lengths[0] // EXECUTE
     assert rise[:acts].mean() > rise[acts : 8 * acts].mean()
+
+
+@pytest.mark.server
+@pytest.mark.slow
+@pytest.mark.integration
+def test_a_worker_plays_while_the_learner_learns_and_no_episode_is_older_than_the_lag(tmp_path: Path) -> None:
+    with ray_folder() as folder:
+        command = [sys.executable, flow.__file__, "learn", "grpo", "--out", str(tmp_path / "run"), "--max-lag", "1"]
+        command += ["--iterations", "2", "--episodes", "64", "--held-out", "2"]
+        done = subprocess.run(
+            command,
+            env=os.environ | {"RAY_TMPDIR": str(folder)},
+            capture_output=True,
+            text=True,
+            timeout=500,
+            check=False,
+        )
+        assert done.returncode == 0, done.stdout + done.stderr
+        assert not processes(folder), "left running"
+    assert "iteration 2: " in done.stdout
