@@ -173,7 +173,9 @@ class FlowLearner:
         parts = [name.removeprefix("state.") for name in columns if name.startswith("state.")]
         for some in np.array_split(rows, max(1, len(rows) // 64)):  # so many images stay in the cache
             obs = [Obs({}, float(columns["gripper"][i]), {p: columns[f"state.{p}"][i] for p in parts}) for i in some]
-            state = normalised(robot, np.stack([state_vector(o, robot.state) for o in obs]), 8)
+            state = normalised(
+                robot, np.stack([state_vector(o, robot.state) for o in obs]), self._checkpoint.sizes.state
+            )
             images = [torch.from_numpy(columns[f"cameras.{robot.cameras[name]}"][some]) for name in CAMERAS]
             words = torch.from_numpy(np.stack([tokens[columns["instruction"][i]] for i in some]))
             seen = pixels(torch.stack(images, 1)).unbind(1)
