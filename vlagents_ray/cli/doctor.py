@@ -14,14 +14,14 @@ import subprocess
 import sys
 import tempfile
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
 from rich.console import Console
 from rich.text import Text
 
-from vlagents_ray.cli.console import table
+from vlagents_ray.cli.console import print_json, table
 from vlagents_ray.errors import MissingDependency
 from vlagents_ray.policies.base.accelerator import OLDEST_DRIVERS, driver_version
 from vlagents_ray.registry import require
@@ -171,16 +171,18 @@ def port_free(port: int) -> Check:
     return Check("ok", "free")
 
 
-def run(console: Console, port: int = DEFAULT_PORT, pythons: Sequence[Path] = ()) -> int:
+def run(console: Console, port: int = DEFAULT_PORT, pythons: Sequence[Path] = (), *, as_json: bool = False) -> int:
     """Print a row for each check, see `checks`. Returns the exit code: 1 if any check failed, else 0."""
-    rows = table("check", "", "found", "cure", box=None, header_style="bold", pad_edge=False)
-    failed = False
     with console.status("looking around; rendering a frame takes some seconds"):
-        for name, check in checks(port, pythons):
-            failed |= check.status == "fail"
+        found = list(checks(port, pythons))
+    if as_json:
+        print_json([{"check": name, **asdict(check)} for name, check in found])
+    else:
+        rows = table("check", "", "found", "cure", box=None, header_style="bold", pad_edge=False)
+        for name, check in found:
             rows.add_row(name, Text(check.status, _STYLE[check.status]), Text(check.detail), Text(check.cure))
-    console.print(rows, width=None if console.is_terminal else _WIDTH)
-    return int(failed)
+        console.print(rows, width=None if console.is_terminal else _WIDTH)
+    return int(any(check.status == "fail" for _, check in found))
 
 
 def checks(port: int = DEFAULT_PORT, pythons: Sequence[Path] = ()) -> Iterator[tuple[str, Check]]:
