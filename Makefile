@@ -195,6 +195,8 @@ lint: $(TOOLS)/.installed
 	@echo '== lint'
 	$(TOOLS)/bin/ruff check .
 	$(TOOLS)/bin/ruff format --check .
+	$(TOOLS)/bin/codespell
+	$(TOOLS)/bin/zizmor --quiet --offline --strict-collection --no-progress .github/workflows
 	@echo '== layers'
 	$(TOOLS)/bin/lint-imports
 

@@ -44,7 +44,9 @@ def report_command(
             from vlagents_ray.cli.evaluation import follow, live_address
 
             if len(folders) != 1 or path is not None or as_json:
-                raise ConfigError("--live shows one folder, and writes nothing: want one FOLDER, no --out and no --json")
+                raise ConfigError(
+                    "--live shows one folder, and writes nothing: want one FOLDER, no --out and no --json"
+                )
             follow(folders[0], live_address(live_at))
             return
         results = combined([Results.load(folder) for folder in folders])
