@@ -6,6 +6,7 @@ import errno
 import importlib.metadata
 import json
 import os
+import platform
 import re
 import resource
 import shutil
@@ -41,7 +42,6 @@ _SESSION_SOCKET = "/ray/session_2026-01-01_00-00-00_000000_1234567/sockets/plasm
 _DISK_FULL = 0.95
 DEFAULT_PORT = 8000
 _FIRST_FREE = 1024  # ports below are root's
-OLDEST_PYTHON = (3, 10)
 _WIDTH = 120  # columns of the table in a file or a pipe
 _STYLE = {"ok": "green", "warn": "yellow", "fail": "bold red"}
 # Prints the versions of torch and JAX in an interpreter, their CUDA, and the GPU that they use or what prevents it.
@@ -188,7 +188,7 @@ def run(console: Console, port: int = DEFAULT_PORT, pythons: Sequence[Path] = ()
 def checks(port: int = DEFAULT_PORT, pythons: Sequence[Path] = ()) -> Iterator[tuple[str, Check]]:
     """Yield names and results of all checks; `pythons` take the place of those that `env make` made in this folder."""
     todo: list[tuple[str, Callable[[], Check]]] = [
-        ("Python", lambda: python(sys.version_info[:3])),
+        ("Python", lambda: Check("ok", f"{platform.python_version()} at {sys.executable}")),
         ("Ray", ray),
         ("HAProxy", haproxy),
         ("GPU", gpu),
@@ -215,15 +215,6 @@ def guarded(check: Callable[[], Check]) -> Check:
         return Check("warn", found, cure)
     except Exception as error:  # noqa: BLE001 - drivers and codecs raise anything; the other rows still matter
         return Check("warn", f"the check itself broke: {type(error).__name__}: {error}", "please report this")
-
-
-def python(version: tuple[int, ...]) -> Check:
-    """Check that the package supports this Python, (major, minor, micro)."""
-    detail = f"{'.'.join(map(str, version))} at {sys.executable}"
-    if version[:2] >= OLDEST_PYTHON:
-        return Check("ok", detail)
-    oldest = ".".join(map(str, OLDEST_PYTHON))
-    return Check("fail", detail, f"install Python {oldest} or newer; `make setup` uses 3.11")
 
 
 def ray() -> Check:

@@ -17,8 +17,7 @@ from vlagents_ray.serve.access.key_store import new_key, read_keys, revoke
 
 keys = typer.Typer(no_args_is_help=True, help="The API keys of a server: make, list and revoke them.")
 File = Annotated[
-    Path | None,
-    typer.Option("--keys", help=f"File of the API keys; default: {FILE_VARIABLE}, or keys.json in this folder."),
+    Path | None, typer.Option("--keys", help=f"The key file; default: {FILE_VARIABLE}, or keys.json in this folder.")
 ]
 Name = Annotated[str, typer.Argument(help="Who has the key: arm-1, lab, …")]
 _DAY_S = 86_400

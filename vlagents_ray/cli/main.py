@@ -144,11 +144,6 @@ def _list(listed: Sequence[Listed], name: str | None, *, as_json: bool) -> None:
         out.print(f"  {line}")
 
 
-@env.callback()
-def _group() -> None:
-    """Keep `make` a subcommand."""
-
-
 @env.command("make")
 def make(
     requirements: Annotated[Path, typer.Argument(help="A requirements file: requirements/lerobot.txt.")],

@@ -36,8 +36,7 @@ LiveAt = Annotated[
 ]
 
 StateDims = Annotated[
-    list[str],
-    typer.Option("--state-dim", metavar="PART=N", help="Numbers in a part for which the policy does not say."),
+    list[str], typer.Option("--state-dim", metavar="PART=N", help="Numbers in a part, where the policy does not say.")
 ]
 _Options = TypeVar("_Options")
 

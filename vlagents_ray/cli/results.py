@@ -22,7 +22,7 @@ Folder = Annotated[Path, typer.Argument(metavar="FOLDER", help="Folder of result
 def report_command(
     folders: Annotated[list[Path], typer.Argument(metavar="FOLDER...", help="Folders of results.")],
     path: Annotated[
-        Path | None, typer.Option("--out", help="The page; default: report.html in FOLDER; of several, here.")
+        Path | None, typer.Option("--out", help="Default: report.html in FOLDER; of several, here.")
     ] = None,
     inline: Annotated[bool, typer.Option("--inline", help="With videos in the page, as far as they fit.")] = False,
     as_json: AsJson = False,
@@ -127,9 +127,7 @@ def merge_command(
 
 def bundle_command(
     folder: Folder,
-    file: Annotated[
-        Path | None, typer.Option("--out", help="The file; default: FOLDER.bundle.zip beside FOLDER.")
-    ] = None,
+    file: Annotated[Path | None, typer.Option("--out", help="The file; default: FOLDER.bundle.zip.")] = None,
     videos: Annotated[bool, typer.Option("--videos", help="With its videos, which may be large.")] = False,
 ) -> None:
     """Write an evaluation as one file: database, differences from commits, trajectories, digests."""
@@ -159,15 +157,15 @@ def verify_command(
     with errors():
         found = verify(bundle, into=into, replay=replay, trust=trust, most_bytes=int(max_gb * 1e9))
         if as_json:
-            print_json(asdict(found) | {"holds": found.holds})
-            raise typer.Exit(not found.holds)
-        rows = table("what", "found", "detail", box=None)
-        for one in found.findings:
-            rows.add_row(one.subject, one.verdict, one.detail)
-        out.print(rows)
-        out.print(f"\nbundle sha256:{found.digest}: {'holds' if found.holds else 'is contradicted'}")
-        if into is not None:
-            out.print(f"results: {into}")
+            print_json({"holds": found.holds, **asdict(found)})
+        else:
+            rows = table("what", "found", "detail", box=None)
+            for one in found.findings:
+                rows.add_row(one.subject, one.verdict, one.detail)
+            out.print(rows)
+            out.print(f"\nbundle sha256:{found.digest}: {'holds' if found.holds else 'is contradicted'}")
+            if into is not None:
+                out.print(f"results: {into}")
     raise typer.Exit(not found.holds)
 
 
@@ -183,9 +181,7 @@ def replay_command(
     horizon: Annotated[int | None, typer.Option(min=1, help="Of a dataset: rows of a chunk that are compared.")] = None,
     every: Annotated[int, typer.Option(min=1, help="Of a dataset without answers: each so many-th frame.")] = 1,
     at_once: Annotated[int, typer.Option(min=1, help="Of a dataset: episodes that share a batch.")] = 8,
-    camera_map: Annotated[
-        str | None, typer.Option(help="Of a dataset: POLICY=DATASET, as base=top,wrist=left.")
-    ] = None,
+    camera_map: Annotated[str | None, typer.Option(help="Of a dataset: POLICY=DATASET, as base=top.")] = None,
     state: Annotated[str | None, typer.Option(help="Of a dataset: parts of observation.state in order.")] = None,
 ) -> None:
     """Play an episode of an evaluation again: exit code 0 if all is the same. Or play a dataset to another policy.
@@ -204,9 +200,7 @@ def replay_command(
             chosen = None if only is None else parse_episodes(only)
             pairs = [part.partition("=") for part in parse_list(camera_map or "")]
             if odd := [name for name, equals, _ in pairs if not equals]:
-                raise ConfigError(
-                    f"--camera-map: got {odd[0]!r}, want POLICY=DATASET, such as base=top,wrist=wrist_left"
-                )
+                raise ConfigError(f"--camera-map: got {odd[0]!r}, want POLICY=DATASET, such as base=top,wrist=left")
             renamed = {name: camera for name, _, camera in pairs}
             names = Names(renamed, None if state is None else parse_list(state))
             plan = ReplayPlan(chosen, horizon, every, at_once, names)

@@ -14,7 +14,7 @@ import json
 import sys
 import time
 from collections.abc import Sequence
-from dataclasses import asdict
+from dataclasses import asdict, replace
 
 from vlagents_ray.client.agent import RemoteAgent
 from vlagents_ray.errors import VLAgentsError
@@ -37,9 +37,8 @@ def main(arguments: Sequence[str]) -> int:
         print(f"{type(error).__name__}: {error}", file=sys.stderr)  # noqa: T201
         return 2
     if options.json:
-        own = {"ok": report.ok, "findings": [asdict(one) for one in report.findings]}
-        beside = {"passed": report.passed, "skipped": report.skipped, "figures": report.figures}
-        print(json.dumps(own | beside, indent=2))  # noqa: T201
+        document = {"ok": report.ok, **asdict(replace(report, pictures={}))}
+        print(json.dumps(document, indent=2))  # noqa: T201
     else:
         print("\n".join(report.lines()))  # noqa: T201
     if options.out:
