@@ -149,7 +149,7 @@ programs: setup $(patsubst %,$(VENV)-%/.installed,$(filter lerobot%,$(FAMILIES))
 $(VENV)-%/.installed: requirements/%.txt requirements/testing.txt $(wildcard requirements/*.cpu.txt) $(VENV)/server.txt \
     vlagents_ray/policies/base/import_fixes.py
 	$(BIN)/vlagents-ray env make $< $(addprefix --with ,requirements/testing.txt $(wildcard requirements/$*.testing.txt)) \
-	  $(if $(TORCH_CUDA),--cuda) --into $(VENV)-$*
+	  $(if $(TORCH_CUDA),--cuda) --out $(VENV)-$*
 	@touch $@
 
 # From the sources alone: nothing of what the reference describes is imported.
@@ -195,6 +195,8 @@ lint: $(TOOLS)/.installed
 	@echo '== lint'
 	$(TOOLS)/bin/ruff check .
 	$(TOOLS)/bin/ruff format --check .
+	$(TOOLS)/bin/codespell
+	$(TOOLS)/bin/zizmor --quiet --offline --strict-collection --no-progress .github/workflows
 	@echo '== layers'
 	$(TOOLS)/bin/lint-imports
 

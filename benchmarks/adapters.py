@@ -21,7 +21,7 @@ from typing import Annotated, Any
 import numpy as np
 import typer
 
-from benchmarks.console import Json, save
+from benchmarks.console import Out, save
 from vlagents_ray.cli.console import errors
 from vlagents_ray.cli.options import parse_dims
 from vlagents_ray.interface import Act, Agent, Obs
@@ -127,16 +127,16 @@ def main(
     rank: Annotated[int, typer.Option(min=1, help="Rank of the adapters.")] = 16,
     state: Annotated[list[str] | None, typer.Option(help="NAME=LENGTH of a part of the state.")] = None,
     rounds: Annotated[int, typer.Option(min=1, help="Batches of all sessions.")] = 7,
-    json_file: Json = None,
+    out_file: Out = None,
 ) -> None:
     """Measure the cost of sessions with many fine-tunes: adapters over one base, against a model for each."""
     with errors():
-        dims = parse_dims(state or [], "--state")
+        dims = parse_dims(state or [], "--state-dim")
         found = measure_adapters(policy, {"checkpoint": checkpoint}, dims, sessions, rank, rounds)
     for way, row in found.items():
         rate = statistics.median(row["acts_per_cpu_s"])
         typer.echo(f"{way:12} {row['resident_mib']:7.0f} MiB of the process, {rate:6.1f} acts a second of CPU time")
-    save(found, json_file)
+    save(found, out_file)
 
 
 if __name__ == "__main__":

@@ -22,7 +22,7 @@ from typing import Annotated, Any, NamedTuple
 import numpy as np
 import typer
 
-from benchmarks.console import Json, save
+from benchmarks.console import Out, save
 from benchmarks.environments import ACTION_DIM, SLEEPING_ENV
 from benchmarks.robots import RobotBurst
 from vlagents_ray.bench.line_process import LineProcess, ProcessFailed, our_environment
@@ -309,7 +309,7 @@ def main(
     robots: Annotated[int, typer.Option(min=1, help="That come at once.")] = 12,
     workers: Annotated[int, typer.Option(min=1, help="Of the evaluation that comes after them.")] = 8,
     seconds: Annotated[float, typer.Option(min=1, help="That each of the two stays, about.")] = 25.0,
-    json_file: Json = None,
+    out_file: Out = None,
     plot: Annotated[Path | None, typer.Option("--plot", help="Draw the figures here: .png, .svg or .pdf.")] = None,
 ) -> None:
     """Measure replicas over time while robots and rollouts start and end, from no replica and back to none."""
@@ -317,7 +317,7 @@ def main(
         check_plot_file(plot)
         found = measure_autoscaling(AutoscalingPlan(robots=robots, workers=workers, seconds=seconds), progress)
         show_autoscaling(found)
-        save(found, json_file)
+        save(found, out_file)
         if plot is not None:
             plot_autoscaling(found, plot)
             out.print(f"wrote {plot}")

@@ -24,7 +24,7 @@ from typing import Annotated, Any
 
 import typer
 
-from benchmarks.console import Json, Transports, save, show_skipped
+from benchmarks.console import Out, Transports, save, show_skipped
 from benchmarks.figures import measured_on
 from benchmarks.own_clients import OwnClient, connect, observation, own_clients
 from vlagents_ray.cli.console import errors, out, table
@@ -143,7 +143,7 @@ def count_acts(own: Sequence[OwnClient], acts: int) -> list[dict[str, Any]]:
 def main(
     acts: Annotated[int, typer.Option(min=1, help="Acts that are counted.")] = 200,
     transports: Transports = "",
-    json_file: Json = None,
+    out_file: Out = None,
 ) -> None:
     """Count the calls of Python and C, the system calls and the context switches of one act, by transport."""
     with errors():
@@ -157,7 +157,7 @@ def main(
                 rows.add_row(way["way"], side, *(f"{way[side].get(name, float('nan')):.1f}" for name in names))
         out.print(rows)
         show_skipped(found)
-        save(found, json_file)
+        save(found, out_file)
 
 
 if __name__ == "__main__":

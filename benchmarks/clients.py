@@ -17,7 +17,7 @@ from typing import Annotated
 
 import typer
 
-from benchmarks.console import Json, save, show_round_trips
+from benchmarks.console import Out, save, show_round_trips
 from benchmarks.drivers import ClientProcess, Driver
 from benchmarks.own_clients import OwnClient, connected, observation
 from benchmarks.round_trips import POLICY, RoundTripsOfAll, in_turns
@@ -83,16 +83,14 @@ def _save(obs: Obs, folder: Path) -> None:
     (folder / "obs.json").write_text(json.dumps({"cameras": cameras, "gripper": obs.gripper, "state": state}))
 
 
-def main(
-    calls: Annotated[int, typer.Option(min=1, help="Acts of each client.")] = 2000, json_file: Json = None
-) -> None:
+def main(calls: Annotated[int, typer.Option(min=1, help="Acts of each client.")] = 2000, out_file: Out = None) -> None:
     """Measure round trips of the clients in other languages, beside the Python client's."""
     with errors():
         with running_server(deployment(POLICY), host="127.0.0.1") as server:
             [url] = server.apps.values()
             found = measure_clients(url, calls, progress).to_json()
         show_round_trips(found, "one act, raw pixels, on one machine")
-        save(found, json_file)
+        save(found, out_file)
 
 
 if __name__ == "__main__":

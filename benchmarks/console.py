@@ -17,7 +17,7 @@ from vlagents_ray.errors import ConfigError
 Calls = Annotated[int, typer.Option(min=1, help="Round trips by each way.")]
 Seconds = Annotated[float, typer.Option(min=0.1, help="Of each measurement.")]
 Rounds = Annotated[int, typer.Option(min=1)]
-Json = Annotated[Path | None, typer.Option("--json", help="Write the figures here.")]
+Out = Annotated[Path | None, typer.Option("--out", help="File of the figures, as JSON.")]
 Transports = Annotated[str, typer.Option(help="shm,websocket,http,handle,plasma; default: all.")]
 _WITH_INTERVALS = 5  # ratios in a row that fit on a screen with their intervals; the file of figures has all
 

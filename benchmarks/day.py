@@ -30,7 +30,7 @@ from unittest import mock
 import numpy as np
 import typer
 
-from benchmarks.console import Json, save
+from benchmarks.console import Out, save
 from vlagents_ray.chunking import buffer, player
 from vlagents_ray.chunking.player import ChunkPlayer, PlayerSettings
 from vlagents_ray.cli.console import errors, out
@@ -485,19 +485,19 @@ def main(
     seed: int = 0,
     hours: Annotated[float, typer.Option(help="of simulated time")] = 24.0,
     ticks: Annotated[int, typer.Option(help="measure the cost of so many ticks, and play no day")] = 0,
-    json: Json = None,
+    out_file: Out = None,
 ) -> None:
     """Play a day with faults, and compare its steps with those of ten minutes without."""
     if ticks:
         measured = measure_ticks(ticks)
-        save({"ticks": measured}, json)
+        save({"ticks": measured}, out_file)
         for name, figures in measured.items():
             out.print(f"{name}: {figures}")
         return
     with errors():
         normal = play_day(seed, 1 / 6, faults=False).largest_step
         report = play_day(seed, hours, normal_step=normal)
-    save({"day": asdict(report)}, json)
+    save({"day": asdict(report)}, out_file)
     for name, value in asdict(report).items():
         out.print(f"{name}: {value}")
     if report.violations:

@@ -38,7 +38,7 @@ from typing import Annotated, Any, NamedTuple
 import typer
 
 import vlagents_ray
-from benchmarks.console import Json, save, show_skipped
+from benchmarks.console import Out, save, show_skipped
 from benchmarks.environments import TIMED_ENV, read_episode_times
 from benchmarks.peers import PYTHON, SCRIPTS, PeersPython, installed
 from benchmarks.report import evaluation_outcomes, show_outcomes
@@ -54,7 +54,7 @@ from vlagents_ray.serve.ports import LOOPBACK, free_block
 OURS = "vlagents-ray"
 SPLIT = "vlagents, split"  # into a configuration for each worker
 PEERS = {"vlagents": "vlagents_peer.py", "vla-eval": "vla_eval_peer.py", "lerobot": "lerobot_eval_peer.py"}  # scripts
-_SIMULATORS = "vlagents-ray env make benchmarks/peers/requirements-simulators.txt --light --into .venv-peers-simulators"
+_SIMULATORS = "vlagents-ray env make benchmarks/peers/requirements-simulators.txt --light --out .venv-peers-simulators"
 _CURES = {
     "vlagents": "`python -m benchmarks.peers` makes an environment",
     "vla-eval": f"`python -m benchmarks.peers` makes an environment, with simulators `{_SIMULATORS}`",
@@ -267,9 +267,9 @@ def main(
     ] = "tabletop",
     chunk: Annotated[int, typer.Option(min=1, help="Rows of each answer of ours, all of which are executed.")] = 1,
     peers_python: PeersPython = PYTHON,
-    json_file: Json = None,
+    out_file: Out = None,
     report: Annotated[
-        Path | None, typer.Option(help="Add the figures to this file of `python -m benchmarks.report --json`.")
+        Path | None, typer.Option(help="Add the figures to this file of `python -m benchmarks.report --out`.")
     ] = None,
 ) -> None:
     """Measure episodes a minute of whole evaluations: `vlagents-ray eval`, and the peers' own commands, in turns."""
@@ -277,7 +277,7 @@ def main(
         plan = EvaluationPlan(episodes, workers, rounds, size, max_steps, env_ms, env, chunk)
         found = measure_evaluation(plan, peers=parse_list(peers), peers_python=peers_python, progress=progress)
     show_evaluation(found)
-    save(found, json_file)
+    save(found, out_file)
     if report is not None:
         save({**json.loads(report.read_text()), "evaluation": found}, report)
 

@@ -18,7 +18,7 @@ from typing import Annotated, Any
 import numpy as np
 import typer
 
-from benchmarks.console import Json, save
+from benchmarks.console import Out, save
 from benchmarks.far_carrier import Conditions
 from benchmarks.far_link import FarLink
 from benchmarks.far_robot import HZ, MODES
@@ -183,7 +183,7 @@ def main(
     seconds: Annotated[float, typer.Option(min=8, help="Of each run, beside the cut.")] = 10.0,
     modes: Annotated[str, typer.Option(help="Which ones, with commas; default: all.")] = ",".join(MODES),
     congestion: Annotated[str, typer.Option(help="TCP's congestion control: cubic, bbr.")] = "cubic",
-    json_file: Json = None,
+    out_file: Out = None,
 ) -> None:
     """Measure a robot whose policy is far away."""
     with errors():
@@ -198,7 +198,7 @@ def main(
     for one in rows:
         shown.add_row(*_shown(one))
     out.print(shown)
-    save({"congestion": congestion, "rows": [asdict(one) for one in rows]}, json_file)
+    save({"congestion": congestion, "rows": [asdict(one) for one in rows]}, out_file)
 
 
 def _shown(one: Row) -> tuple[str, ...]:

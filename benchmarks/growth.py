@@ -22,7 +22,7 @@ import numpy as np
 import typer
 
 from benchmarks.autoscaling import check_plot_file
-from benchmarks.console import Json, parse_counts, save
+from benchmarks.console import Out, parse_counts, save
 from benchmarks.drivers import START_S
 from benchmarks.figures import measured_on
 from benchmarks.processes import UsageMeter, count_idle, server_processes
@@ -175,7 +175,7 @@ def main(
     rate: Annotated[float, typer.Option(min=10, help="Acts a second of all sessions of a curve together.")] = 50.0,
     seconds: Annotated[float, typer.Option(min=1, help="Of each measurement.")] = 20.0,
     transport: Annotated[str, typer.Option(help="websocket, http or shm.")] = "websocket",
-    json_file: Json = None,
+    out_file: Out = None,
     plot: Annotated[Path | None, typer.Option("--plot", help="Draw the curves here: .png, .svg or .pdf.")] = None,
 ) -> None:
     """Measure a fleet of robots, and the cost of an act by the number of sessions and of replicas."""
@@ -190,7 +190,7 @@ def main(
         )  # fmt: skip
         found = measure_growth(plan, progress)
         show_growth(found)
-        save({**origin, **found}, json_file)
+        save({**origin, **found}, out_file)
         if plot is not None:
             plot_growth(found, plot)
 

@@ -10,7 +10,7 @@ from typing import Annotated, Any
 
 import typer
 
-from benchmarks.console import Json, save, show_round_trips
+from benchmarks.console import Out, save, show_round_trips
 from benchmarks.own_clients import observation
 from benchmarks.round_trips import RoundTripsOfAll, in_turns
 from vlagents_ray.cli.console import errors, progress
@@ -70,13 +70,13 @@ class _Driver:
 def main(
     calls: Annotated[int, typer.Option(min=1, help="Acts by each way.")] = 2000,
     python: Annotated[str, typer.Option(help="The child's interpreter; default: this one.")] = sys.executable,
-    json_file: Json = None,
+    out_file: Out = None,
 ) -> None:
     """Measure the cost of a policy in a child process behind the replica, against one in the replica."""
     with errors():
         found = measure_hop(calls, python, progress).to_json()
     show_round_trips(found, "one act, as the batch queue sees it")
-    save(found, json_file)
+    save(found, out_file)
 
 
 if __name__ == "__main__":

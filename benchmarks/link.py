@@ -23,7 +23,7 @@ from typing import Annotated, Any
 import typer
 
 from benchmarks import peers as others
-from benchmarks.console import Calls, Json, save, show_round_trips
+from benchmarks.console import Calls, Out, save, show_round_trips
 from benchmarks.figures import measured_on
 from benchmarks.own_clients import OwnClient
 from benchmarks.round_trips import measure
@@ -239,7 +239,7 @@ def main(
     delay: Annotated[str | None, typer.Option(help="Each way, as tc writes it: 2ms. Needs the kernel's netem.")] = None,
     peers: others.Peers = "vlagents,openpi",
     peers_python: others.PeersPython = others.PYTHON,
-    json_file: Json = None,
+    out_file: Out = None,
 ) -> None:
     """Measure round trips over a link of 1 Gbit/s between two network namespaces on this machine."""
     with errors():
@@ -248,7 +248,7 @@ def main(
             calls, rate=rate, delay=delay, peers=parse_list(peers), peers_python=peers_python, progress=progress
         )  # fmt: skip
         show_round_trips(found, f"round trip of one act over {found['link']['measured_mbit_per_s']:.0f} Mbit/s")
-        save({**origin, **found, "versions": origin["versions"] | found["versions"]}, json_file)
+        save({**origin, **found, "versions": origin["versions"] | found["versions"]}, out_file)
 
 
 if __name__ == "__main__":

@@ -27,7 +27,7 @@ import numpy as np
 import typer
 from websockets.sync.client import connect
 
-from benchmarks.console import Json, save
+from benchmarks.console import Out, save
 from benchmarks.drivers import START_S
 from benchmarks.own_clients import observation
 from benchmarks.processes import cpu_seconds
@@ -261,7 +261,7 @@ def main(
     seconds: Annotated[float, typer.Option(help="Length of a turn, s.")] = 5.0,
     viewers: Annotated[list[int], typer.Option(help="Viewers at once, repeatable.")] = [1, 4],  # noqa: B006
     transport: Annotated[str, typer.Option(help="Of the robots.")] = "websocket",
-    json_file: Json = None,
+    out_file: Out = None,
 ) -> None:
     """Measure the cost of the live page for robots, with no, one and four viewers."""
     with errors():
@@ -285,7 +285,7 @@ def main(
         shown.add_row(*row)
     out.print(shown)
     out.print(f"compression of the viewers' messages: {', '.join(found['websocket_extensions']) or 'none'}")
-    save(found, json_file)
+    save(found, out_file)
 
 
 if __name__ == "__main__":

@@ -26,7 +26,7 @@ from typing import Annotated, Any, NamedTuple
 import numpy as np
 import typer
 
-from benchmarks.console import Json, save
+from benchmarks.console import Out, save
 from benchmarks.processes import cpu_seconds
 from vlagents_ray.cli.console import errors, out, progress, table
 from vlagents_ray.cli.options import parse_settings
@@ -282,7 +282,7 @@ def main(
     workers: Annotated[int, typer.Option(min=1)] = 2,
     episodes: Annotated[int, typer.Option(min=1, help="For each worker and round.")] = 8,
     rounds: Annotated[int, typer.Option(min=1)] = 3,
-    json_file: Json = None,
+    out_file: Out = None,
     env_set: Annotated[list[str], typer.Option("--env-set", metavar="KEY=VALUE")] = [],  # noqa: B006
 ) -> None:
     """Measure steps a second, and CPU time a step, of an evaluation against the bare environments."""
@@ -294,7 +294,7 @@ def main(
     show_overhead(found)
     data = found.to_json()
     out.print(f"median ratio {found.ratio:.3f}, CPU time added to a step {data['median_added_cpu_ms_per_step']:.3f} ms")
-    save(data, json_file)
+    save(data, out_file)
 
 
 if __name__ == "__main__":

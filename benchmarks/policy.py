@@ -17,7 +17,7 @@ import numpy as np
 import typer
 from typing_extensions import Self
 
-from benchmarks.console import Json, Rounds, Seconds, parse_counts, save
+from benchmarks.console import Out, Rounds, Seconds, parse_counts, save
 from benchmarks.figures import measured_on
 from benchmarks.network import NetworkTimer, profile
 from vlagents_ray.bench.measured_policy import (
@@ -174,7 +174,7 @@ def main(
     image: Annotated[int, typer.Option(min=1, help="Pixels a side, where the policy takes any image.")] = 224,
     state: StateDims = [],  # noqa: B006
     settings: Set = [],  # noqa: B006
-    json_file: Json = None,
+    out_file: Out = None,
 ) -> None:
     """Measure actions a second of one policy by batch size, bare and behind its batch queue, without Ray."""
     from vlagents_ray.serve.launch.deployment_file import server_args  # which imports Ray for the schema of the file
@@ -183,10 +183,10 @@ def main(
         origin = measured_on("python -m benchmarks.policy")
         args, batches = server_args(file, app), parse_counts(batch, "--batch")
         args = args.model_copy(update={"config": args.config | parse_settings(settings, "--set")})
-        plan = PolicyPlan(args, batches, seconds, rounds, image, parse_dims(state, "--state"))
+        plan = PolicyPlan(args, batches, seconds, rounds, image, parse_dims(state, "--state-dim"))
         found = measure_policy(plan, progress)
     show_policy(found)
-    save({**origin, **found}, json_file)
+    save({**origin, **found}, out_file)
 
 
 def show_policy(found: Mapping[str, Any]) -> None:

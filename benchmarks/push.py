@@ -15,7 +15,7 @@ import ray
 import typer
 from pydantic import BaseModel
 
-from benchmarks.console import Json, save
+from benchmarks.console import Out, save
 from vlagents_ray import RemoteAgent
 from vlagents_ray.cli.console import out
 from vlagents_ray.errors import VLAgentsError
@@ -162,7 +162,7 @@ def main(
     base_ms: Annotated[float, typer.Option(help="Time of a batch.")] = 20.0,
     rounds: Annotated[int, typer.Option(min=1)] = 5,
     seconds: Annotated[float, typer.Option(help="For which the sessions act, without a push and with one.")] = 4.0,
-    json_file: Json = None,
+    out_file: Out = None,
 ) -> None:
     """Push weights under acting sessions."""
     found = measure_push(int(parameters), dtype, sessions, base_ms, rounds, seconds)
@@ -181,7 +181,7 @@ def main(
         ("longest act without a push, ms", [row["alone"]["longest_ms"] for row in found]),
     ):
         out.print(f"median {name}: {statistics.median(value):.2f}")
-    save(found, json_file)
+    save(found, out_file)
 
 
 if __name__ == "__main__":

@@ -73,11 +73,11 @@ def collect(
     return results
 
 
-def write(results: Mapping[str, Any], page: Path, json_file: Path | None) -> None:
-    """Write the section into the page, its picture beside it, and the figures into `json_file` for the next time."""
-    if json_file is not None:
-        json_file.parent.mkdir(parents=True, exist_ok=True)
-        json_file.write_text(json.dumps(results, indent=1) + "\n")
+def write(results: Mapping[str, Any], page: Path, file: Path | None) -> None:
+    """Write the section into the page, its picture beside it, and the figures into `file` for the next time."""
+    if file is not None:
+        file.parent.mkdir(parents=True, exist_ok=True)
+        file.write_text(json.dumps(results, indent=1) + "\n")
     text = replaced(page.read_text(), section(results))
     if results.get("rtt"):
         picture = page.parent / PICTURE
@@ -370,11 +370,11 @@ def main(
     page: Annotated[Path, typer.Option(help="Its text between the bench markers is replaced.")] = Path(
         "docs/measured.md"
     ),
-    json_file: Annotated[Path, typer.Option("--json", help="Keep the figures here.")] = Path("benchmarks/latest.json"),
+    file: Annotated[Path, typer.Option("--out", help="Keep the figures here.")] = Path("benchmarks/latest.json"),
     calls: Calls = 1000,
     seconds: Annotated[float, typer.Option(min=0.1, help="Of each measurement of the throughput.")] = 2.0,
     peers_python: PeersPython = PYTHON,
-    from_json: Annotated[bool, typer.Option("--from-json", help="Measure nothing: use the figures in --json.")] = False,
+    from_json: Annotated[bool, typer.Option("--from-json", help="Measure nothing: use the figures in --out.")] = False,
 ) -> None:
     """Measure round trips, the link and throughput, and write the figures of docs/measured.md again."""
     with errors():
@@ -384,15 +384,15 @@ def main(
         require("matplotlib")
         if from_json:
             try:
-                results = json.loads(json_file.read_text())
+                results = json.loads(file.read_text())
             except (OSError, ValueError) as error:
-                raise ConfigError(f"--json {json_file}: cannot be read ({error})") from error
+                raise ConfigError(f"--out {file}: cannot be read ({error})") from error
         else:
             results = collect(
                 peers_python, calls=calls, link_calls=calls, progress=progress,
                 plan=ThroughputPlan(seconds=seconds, peers=["all"], peers_python=peers_python),
             )  # fmt: skip
-        write(results, page, None if from_json else json_file)
+        write(results, page, None if from_json else file)
     out.print(f"wrote {page}")
 
 

@@ -24,7 +24,7 @@ from typing import Annotated, Any, ClassVar
 import numpy as np
 import typer
 
-from benchmarks.console import Json, parse_counts, save
+from benchmarks.console import Out, parse_counts, save
 from benchmarks.report import Outcome, show_outcomes
 from vlagents_ray.cli.console import errors, out, progress, table
 from vlagents_ray.cli.options import parse_list
@@ -248,7 +248,7 @@ def main(
         str,
         typer.Option(help="TorchRL's collector too: 'grouped' in as many workers, or 'processes', one for each env."),
     ] = "",
-    json_file: Json = None,
+    out_file: Out = None,
 ) -> None:
     """Measure steps a second of each way, and their shares of the loop's."""
     with errors():
@@ -258,7 +258,7 @@ def main(
         )  # fmt: skip
         found = compare_rollouts(plan, progress)
     show_rollouts(found)
-    save(found, json_file)
+    save(found, out_file)
 
 
 if __name__ == "__main__":

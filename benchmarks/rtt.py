@@ -9,7 +9,7 @@ from typing import Any
 import typer
 
 from benchmarks import peers as others
-from benchmarks.console import Calls, Json, Transports, save, show_round_trips, show_use
+from benchmarks.console import Calls, Out, Transports, save, show_round_trips, show_use
 from benchmarks.figures import measured_on
 from benchmarks.own_clients import own_clients
 from benchmarks.round_trips import measure
@@ -48,7 +48,7 @@ def main(
     transports: Transports = "",
     peers: others.Peers = "all",
     peers_python: others.PeersPython = others.PYTHON,
-    json_file: Json = None,
+    out_file: Out = None,
 ) -> None:
     """Measure round trips and CPU time of acts on this machine: every transport, and other policy servers, in turns."""
     with errors():
@@ -59,7 +59,7 @@ def main(
         )  # fmt: skip
         show_round_trips(found, "round trip of one act on this machine")
         show_use(found)
-        save({**origin, **found, "versions": origin["versions"] | found["versions"]}, json_file)
+        save({**origin, **found, "versions": origin["versions"] | found["versions"]}, out_file)
 
 
 if __name__ == "__main__":

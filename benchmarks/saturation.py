@@ -1,6 +1,6 @@
 """A cluster of many workers on paper: which part saturates first, by the costs that `benchmarks.scaling` has measured.
 
-    python -m benchmarks.scaling --json scaling.json
+    python -m benchmarks.scaling --out scaling.json
     python -m benchmarks.saturation scaling.json --workers 1000
 
 Each part has a load that grows with the workers, and a capacity. Loads of Ray's daemons on the head and of the driver
@@ -20,7 +20,7 @@ from typing import Annotated, Any
 import numpy as np
 import typer
 
-from benchmarks.console import Json, save
+from benchmarks.console import Out, save
 from benchmarks.scaling import IMAGE_BYTES, OWN
 from vlagents_ray.cli.console import errors, out, table
 from vlagents_ray.errors import ConfigError
@@ -127,7 +127,7 @@ def show_parts(rows: list[dict[str, Any]], load: Load) -> None:
 
 
 def main(
-    scaling: Annotated[Path, typer.Argument(help="The figures of `python -m benchmarks.scaling --json`.")],
+    scaling: Annotated[Path, typer.Argument(help="The figures of `python -m benchmarks.scaling --out`.")],
     workers: Annotated[int, typer.Option(min=1)] = 1000,
     steps: Annotated[int, typer.Option(min=1, help="Of an episode.")] = 250,
     episode_s: Annotated[float, typer.Option(min=0.1, help="Its length.")] = 30.0,
@@ -136,7 +136,7 @@ def main(
     batch: Annotated[int, typer.Option(min=1, help="Rows of a batch.")] = 16,
     replicas: Annotated[int, typer.Option(min=1)] = 16,
     mbit: Annotated[float, typer.Option(min=1, help="Mbit/s of a node's link.")] = 10_000.0,
-    json_file: Json = None,
+    out_file: Out = None,
 ) -> None:
     """Compute the load of each part of a cluster, and the number of workers that saturates it."""
     with errors():
@@ -145,10 +145,10 @@ def main(
             rows = parts(json.loads(scaling.read_text()), load)
         except (OSError, ValueError, KeyError) as error:
             raise ConfigError(
-                f"{scaling}: got no figures of `python -m benchmarks.scaling --json` ({error!r})"
+                f"{scaling}: got no figures of `python -m benchmarks.scaling --out` ({error!r})"
             ) from error
     show_parts(rows, load)
-    save({"load": asdict(load), "parts": rows}, json_file)
+    save({"load": asdict(load), "parts": rows}, out_file)
 
 
 if __name__ == "__main__":

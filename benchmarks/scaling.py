@@ -27,7 +27,7 @@ from typing import Annotated, Any
 import numpy as np
 import typer
 
-from benchmarks.console import Json, parse_counts, save
+from benchmarks.console import Out, parse_counts, save
 from benchmarks.far_carrier import Conditions
 from benchmarks.far_link import FarLink
 from benchmarks.hosts import Host, hosts, ray_cluster
@@ -314,7 +314,7 @@ def main(
     address: Annotated[
         str | None, typer.Option(help="A running Ray cluster in place of those hosts; they want root.")
     ] = None,
-    json_file: Json = None,
+    out_file: Out = None,
 ) -> None:
     """Measure episodes a minute by the number of workers and nodes, and the cost of the evaluation's driver."""
     with errors():
@@ -325,7 +325,7 @@ def main(
         found = measure_scaling(plan, address, progress)
     show_scaling(found)
     show_driver(found["driver"])
-    save(found, json_file)
+    save(found, out_file)
 
 
 if __name__ == "__main__":

@@ -24,7 +24,7 @@ from typing import Annotated, Any, NamedTuple
 import numpy as np
 import typer
 
-from benchmarks.console import Json, save
+from benchmarks.console import Out, save
 from benchmarks.environments import TIMED_ENV, EpisodeTimes, read_episode_times
 from benchmarks.report import Outcome, show_outcomes, unmeasured
 from vlagents_ray.cli.console import errors, out, progress
@@ -287,13 +287,13 @@ def main(
     episodes: Annotated[int, typer.Option(min=100)] = 10_000,
     workers: Annotated[int, typer.Option(min=1)] = 2,
     kill_every: Annotated[float, typer.Option(min=0, help="Seconds between two kills of a worker; 0: none.")] = 30.0,
-    json_file: Json = None,
+    out_file: Out = None,
 ) -> None:
     """Play many short episodes while workers are killed: check memory, overhead, and that each is played once."""
     with errors():
         found = measure_soak(SoakPlan(episodes, workers, kill_every), progress)
     show_soak(found)
-    save(found, json_file)
+    save(found, out_file)
 
 
 if __name__ == "__main__":

@@ -24,7 +24,7 @@ from typing import Annotated, Any
 
 import typer
 
-from benchmarks.console import Json, save, show_skipped
+from benchmarks.console import Out, save, show_skipped
 from benchmarks.evaluation import EvaluationPlan, alone, our_run, play, their_runs
 from benchmarks.own_clients import observation
 from benchmarks.peers import PYTHON, SCRIPTS, PeersPython, peer_clients
@@ -88,13 +88,13 @@ def main(
     episodes: Annotated[int, typer.Option(min=1)] = 20,
     rounds: Annotated[int, typer.Option(min=1)] = 5,
     peers_python: PeersPython = PYTHON,
-    json_file: Json = None,
+    out_file: Out = None,
 ) -> None:
     """Measure how long evaluations and a server take from cold, ours and vla-eval's."""
     with errors():
         found = measure_startup(EvaluationPlan(episodes, 0, rounds), peers_python, progress)
     show_startup(found)
-    save(found, json_file)
+    save(found, out_file)
 
 
 if __name__ == "__main__":

@@ -22,7 +22,7 @@ import numpy as np
 import typer
 from rich.table import Table
 
-from benchmarks.console import Json, save
+from benchmarks.console import Out, save
 from vlagents_ray import RemoteAgent
 from vlagents_ray.cli.console import errors, out, table
 from vlagents_ray.client.transports.select import TransportName
@@ -308,7 +308,7 @@ def main(
     ] = Path("runs/success"),
     episodes: Annotated[int, typer.Option(min=1, help="Of each way.")] = 500,
     only: Annotated[str, typer.Option(help="Ways, with semicolons between them; default: all.")] = "",
-    json_file: Json = None,
+    out_file: Out = None,
 ) -> None:
     """Play every way, and print the table."""
     with errors(), Players(checkpoint, folder, episodes) as players:
@@ -328,7 +328,7 @@ def main(
                 out.print(f"{way.name}: {found[-1].solved} of {len(found[-1].episodes)}")
         rows = compared(found)
         out.print(shown(rows))
-        save({"ways": rows, "skipped": skipped}, json_file)
+        save({"ways": rows, "skipped": skipped}, out_file)
         if broken := [row["way"] for row in rows if row["must_be_equal"] and row["equal"] < row["episodes"]]:
             raise VLAgentsError(f"actions differ in {broken}, want those of {STANDARD!r} to the bit")
 

@@ -27,7 +27,7 @@ import typer
 
 from benchmarks import peers as others
 from benchmarks.closed_loop import Call
-from benchmarks.console import Json, Rounds, Seconds, parse_counts, save, show_skipped
+from benchmarks.console import Out, Rounds, Seconds, parse_counts, save, show_skipped
 from benchmarks.drivers import START_S
 from benchmarks.figures import mean_interval, measured_on, median_interval
 from benchmarks.own_clients import LoadGenerator, OwnClient, observation, own_clients, save_observation
@@ -306,7 +306,7 @@ def main(
     num_gpus: Annotated[float, typer.Option(min=0, help="That Ray gives to the replica.")] = 0.0,
     peers: others.Peers = "",
     peers_python: others.PeersPython = others.PYTHON,
-    json_file: Json = None,
+    out_file: Out = None,
 ) -> None:
     """Measure actions a second of many clients on one replica, against the ideal, or the bare policy."""
     with errors():
@@ -326,7 +326,7 @@ def main(
         )  # fmt: skip
         found = measure_throughput(plan, progress)
     show_throughput(found)
-    save({**origin, **found, "versions": origin["versions"] | found["versions"]}, json_file)
+    save({**origin, **found, "versions": origin["versions"] | found["versions"]}, out_file)
 
 
 def show_throughput(found: Mapping[str, Any]) -> None:

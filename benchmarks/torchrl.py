@@ -21,7 +21,7 @@ from typing import Annotated, Any
 
 import typer
 
-from benchmarks.console import Json, save
+from benchmarks.console import Out, save
 from vlagents_ray.cli.console import errors, out, progress, table
 from vlagents_ray.errors import ConfigError
 
@@ -115,13 +115,13 @@ def main(
     words: Annotated[list[str], typer.Argument(help="Settings of the recipe, such as collector.total_iters=50.")] = [],  # noqa: B006
     seeds: Annotated[int, typer.Option(min=2, max=10)] = 5,
     python: Annotated[Path, typer.Option(help="With TorchRL and this package.")] = PYTHON,
-    json_file: Json = None,
+    out_file: Out = None,
 ) -> None:
     """Compare success and time of TorchRL's recipe with its inference server and with this one."""
     with errors():
         found = compare(source, python.absolute(), seeds, words, progress)
     show(found)
-    save(found, json_file)
+    save(found, out_file)
 
 
 if __name__ == "__main__":

@@ -18,7 +18,7 @@ from websockets.exceptions import ConnectionClosed
 from websockets.sync.client import connect
 from websockets.sync.server import serve
 
-from benchmarks.console import Json, save, show_round_trips
+from benchmarks.console import Out, save, show_round_trips
 from benchmarks.round_trips import RoundTripsOfAll, in_turns
 from vlagents_ray.cli.console import errors, progress
 from vlagents_ray.client.agent import RemoteAgent
@@ -169,13 +169,13 @@ def main(
     calls: Annotated[int, typer.Option(min=1, help="Acts by each way.")] = 2000,
     size: Annotated[int, typer.Option(min=1, help="Height and width of the two images, pixels.")] = 224,
     whole: Annotated[bool, typer.Option(help="Measure a whole server of ours, too, which starts Ray.")] = False,
-    json_file: Json = None,
+    out_file: Out = None,
 ) -> None:
     """Measure the overhead of the policy `upstream` over the policy server behind it."""
     with errors():
         found = measure_upstream(calls, size, whole, progress).to_json()
     show_round_trips(found, f"one act, two images of {size} x {size} pixels")
-    save(found, json_file)
+    save(found, out_file)
 
 
 if __name__ == "__main__":

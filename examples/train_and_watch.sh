@@ -15,7 +15,7 @@ vlagents-ray eval tabletop/lift --policy scripted --episodes "$episodes" --worke
   --env-set width=48 --env-set height=48 --env-set pucks=1 --env-set object_state=true --out "$out/demos"
 
 # 2. A dataset without cameras, with the place of the puck as the environment's state.
-vlagents-ray export "$out/demos" "$out/dataset" --to lerobot --successes --cut-idle --cameras '' \
+vlagents-ray export "$out/demos" --out "$out/dataset" --to lerobot --successes --cut-idle --cameras '' \
   --state xyzrpy,gripper,puck --environment-state puck
 
 # 3. LeRobot's own command trains, in the background, and is ended if this script is.

@@ -24,16 +24,10 @@ def steps(workflow: Path) -> list[dict[str, Any]]:
 
 
 @pytest.mark.integration
-@pytest.mark.parametrize(
-    "words",
-    [["zizmor", "--offline", "--strict-collection", "--no-progress"], ["jactionlint", "--shellcheck="]],
-    ids=lambda words: words[0],
-)
-def test_workflows_are_well_formed_and_safe(words: list[str]) -> None:
-    name, *options = words
-    program = shutil.which(name, path=Path(sys.executable).parent) or shutil.which(name)
+def test_workflows_are_well_formed() -> None:
+    program = shutil.which("jactionlint", path=Path(sys.executable).parent) or shutil.which("jactionlint")
     assert program is not None
-    done = subprocess.run([program, *options, *WORKFLOWS], capture_output=True, text=True, check=False)
+    done = subprocess.run([program, "--shellcheck=", *WORKFLOWS], capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stdout + done.stderr
     assert len(WORKFLOWS) == 4
 

@@ -216,7 +216,7 @@ class RecordedDataset:
         found = {camera: feature for feature, camera in own.items()} | {feature: feature for feature in pictures}
         if unknown := [name for name in names.cameras.values() if name not in found]:
             raise ConfigError(
-                f"--cameras: {self.root} has no {unknown[0]!r}, want some of {sorted(own.values())}"
+                f"--camera-map: {self.root} has no {unknown[0]!r}, want some of {sorted(own.values())}"
                 f"{did_you_mean(unknown[0], found)}"
             )
         return {found[name]: camera for camera, name in names.cameras.items()}

@@ -20,9 +20,7 @@ def main(
     """Write random weights of a family's true size, and a deployment file; run it in the family's environment."""
     with errors():
         written = write_checkpoint(family, folder, size, dtype)
-    out.print(
-        f"{written.parameters:,} parameters: python -m benchmarks.policy {folder / 'deployment.yaml'} --json FILE"
-    )
+    out.print(f"{written.parameters:,} parameters: python -m benchmarks.policy {folder / 'deployment.yaml'} --out FILE")
 
 
 if __name__ == "__main__":

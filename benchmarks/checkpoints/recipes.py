@@ -65,7 +65,7 @@ def write_checkpoint(family: str, folder: Path, size: SizeName = "full", dtype: 
     if missing := [name for name in known.packages if importlib.util.find_spec(name) is None]:
         raise MissingDependency(
             f"{family}: {sys.executable} has no {', '.join(missing)}; run this command in the family's environment: "
-            f"`vlagents-ray env make requirements/{known.environment}.txt --into .venv-{known.environment}`, then "
+            f"`vlagents-ray env make requirements/{known.environment}.txt --out .venv-{known.environment}`, then "
             f"`.venv-{known.environment}/bin/python -m benchmarks.checkpoints {family} {folder}`"
         )
     folder = folder.absolute()

@@ -1,6 +1,6 @@
 """Stable-Baselines3's PPO on an environment of this package: prints steps and mean return, and learns Pendulum.
 
-pip install stable-baselines3 'vlagents-ray[learn,sim]'
+pip install stable-baselines3 '.[learn,sim]'
 python stable_baselines.py
 """
 

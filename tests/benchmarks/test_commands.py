@@ -41,7 +41,7 @@ from benchmarks.checkpoints import __main__ as checkpoints
         (hop, ["--python", "nowhere"], "nowhere"),
         (report, ["--page", "nowhere.md"], "nowhere.md"),
         (policy, ["noop", "--batch", "0"], "from 1"),
-        (policy, ["noop", "--state", "joints=some"], "joints"),
+        (policy, ["noop", "--state-dim", "joints=some"], "joints"),
         (policy, ["noop", "--set", "colour=blue"], "colour"),
         (policy, ["nowhere.yaml"], "nowhere.yaml"),
         (rollouts, ["--envs", "15"], "multiples of the 2 workers"),

@@ -89,7 +89,7 @@ def test_a_policy_is_measured_with_other_settings_than_its_files(tmp_path: Path)
     command = typer.Typer()
     command.command()(main)
     words = ["noop", "--set", "base_ms=20", "--batch", "1", "--seconds", "0.1", "--rounds", "1"]
-    done = CliRunner().invoke(command, [*words, "--json", str(tmp_path / "found.json")])
+    done = CliRunner().invoke(command, [*words, "--out", str(tmp_path / "found.json")])
     assert done.exit_code == 0, done.output
     [row] = json.loads((tmp_path / "found.json").read_text())["batches"]
     assert row["bare"]["batch_ms"] >= 20

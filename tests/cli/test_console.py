@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import io
-import json
 import re
 import subprocess
 import sys
@@ -124,14 +123,6 @@ def test_of_one_policy_all_is_said(shown: io.StringIO, monkeypatch: pytest.Monke
         policies("opnpi")
     assert ended.value.exit_code == 2
     assert "'opnpi' is not registered; did you mean 'openpi'" in shown.getvalue()
-
-
-def test_a_listing_is_json_for_programs(shown: io.StringIO) -> None:
-    policies(as_json=True)
-    found = {one["name"]: one for one in json.loads(shown.getvalue())}
-    assert found.keys() == {*POLICIES, *WRAPPERS}
-    assert (found["noop"]["kind"], found["noop"]["missing"]) == ("policy", None)
-    assert found["noop"]["details"][0] == "action_dim=7"
 
 
 def test_an_environment_that_has_a_family_is_ready_for_it(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -220,8 +220,6 @@ def test_a_machine_on_which_workers_without_a_gpu_could_not_render_is_told(
 @pytest.mark.parametrize(
     ("judged", "status", "said"),
     [
-        (doctor.python((3, 9, 18)), "fail", ""),
-        (doctor.python((3, 10, 0)), "ok", ""),
         (doctor.judge_shared_memory(total=32 * GB, free=30 * GB, memory=64 * GB), "ok", ""),
         (doctor.judge_shared_memory(total=0.064 * GB, free=0.064 * GB, memory=16 * GB), "warn", "--shm-size=5g"),
         (doctor.judge_shared_memory(total=100 * GB, free=100 * GB, memory=1000 * GB), "ok", ""),  # Ray caps its store

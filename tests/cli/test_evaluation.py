@@ -51,7 +51,7 @@ def test_a_zero_is_a_number_of_retries_steps_and_seconds(monkeypatch: pytest.Mon
     seen: list[Any] = []
     monkeypatch.setattr(run, "run_evaluation", lambda config, _address, **_: seen.append(config.retries))
     monkeypatch.setattr(run, "watch_training", lambda *_args, **options: seen.append(options))
-    for options in (["--retries", "0"], ["--watch", str(tmp_path), "--settle", "0", "--until", "0"]):
+    for options in (["--retries", "0"], ["--watch", str(tmp_path), "--settle-s", "0", "--until", "0"]):
         done = CliRunner().invoke(app, [*WORDS, "--out", str(tmp_path / "out"), *options])
         assert done.exit_code == 0, done.output
     assert seen == [0, {"settle_s": 0.0, "until": 0, "marker": None, "live": None}]

@@ -26,7 +26,7 @@ def played(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def test_cameras_parts_successes_and_ends_of_a_dataset_are_chosen(played: Path, tmp_path: Path) -> None:
     chosen = ["--cameras", "wrist", "--state", "joints, gripper", "--successes", "--cut-idle"]
-    done = export(played, tmp_path / "d", "--to", "lerobot", *chosen)
+    done = export(played, "--out", tmp_path / "d", "--to", "lerobot", *chosen)
     assert done.exit_code == 0, done.output
     assert done.output.startswith("wrote 1 episodes")
     info = json.loads((tmp_path / "d/meta/info.json").read_text())
@@ -36,7 +36,7 @@ def test_cameras_parts_successes_and_ends_of_a_dataset_are_chosen(played: Path, 
 
 
 def test_a_dataset_without_cameras_has_a_state_of_the_environment(played: Path, tmp_path: Path) -> None:
-    done = export(played, tmp_path / "d", "--to", "lerobot", "--cameras", "", "--environment-state", "joints")
+    done = export(played, "--out", tmp_path / "d", "--to", "lerobot", "--cameras", "", "--environment-state", "joints")
     assert done.exit_code == 0, done.output
     features = json.loads((tmp_path / "d/meta/info.json").read_text())["features"]
     assert features["observation.environment_state"]["names"] == ["joints_0", "joints_1"]
@@ -44,16 +44,18 @@ def test_a_dataset_without_cameras_has_a_state_of_the_environment(played: Path, 
 
 
 def test_a_table_has_no_frames_to_choose(played: Path, tmp_path: Path) -> None:
-    done = export(played, tmp_path / "t.csv", "--to", "csv", "--cut-idle", "--state", "joints")
+    done = export(played, "--out", tmp_path / "t.csv", "--to", "csv", "--cut-idle", "--state", "joints")
     assert done.exit_code == 2
     assert "--state, --cut-idle: got --to csv, want --to lerobot" in " ".join(done.output.split())
     assert not (tmp_path / "t.csv").exists()
 
 
 def test_scores_have_settings_and_tables_have_none(played: Path, tmp_path: Path) -> None:
-    done = export(played, tmp_path / "t.csv", "--to", "csv", "--set", "dataset=a/b")
+    done = export(played, "--out", tmp_path / "t.csv", "--to", "csv", "--hub-set", "dataset=a/b")
     assert done.exit_code == 2
-    assert "--set: got --to csv, want --to hub" in " ".join(done.output.split())
-    done = export(played, tmp_path / "card", "--to", "hub", "--set", "dataset=a/b", "--set", "task_id=roll")
+    assert "--hub-set: got --to csv, want --to hub" in " ".join(done.output.split())
+    done = export(
+        played, "--out", tmp_path / "card", "--to", "hub", "--hub-set", "dataset=a/b", "--hub-set", "task_id=roll"
+    )
     assert done.exit_code == 0, done.output
     assert "task_id: roll" in (tmp_path / "card/.eval_results/a_b.yaml").read_text()

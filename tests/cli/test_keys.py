@@ -22,31 +22,31 @@ def keys(*words: str) -> Result:
 
 def test_a_key_is_printed_once_listed_without_it_and_revoked(tmp_path: Path) -> None:
     file = tmp_path / "keys.json"
-    made = keys("new", "arm", "--file", str(file), "--app", "pi0", "--rate", "60", "--sessions", "2", "--days", "30")
+    made = keys("new", "arm", "--keys", str(file), "--app", "pi0", "--rate", "60", "--sessions", "2", "--days", "30")
     assert made.exit_code == 0, made.output
     token = made.stdout.strip()  # nothing else, so that a script can take it
     assert Keys.from_file(file).check(token, "pi0").name == "arm"
     with pytest.raises(Forbidden):
         Keys.from_file(file).check(token, "noop")
-    listed = keys("list", "--file", str(file)).stdout
+    listed = keys("list", "--keys", str(file)).stdout
     for word in ("arm", "pi0", "60", "2", "until"):
         assert word in listed
     assert token not in listed
-    assert keys("revoke", "arm", "--file", str(file)).exit_code == 0
-    assert "revoked" in keys("list", "--file", str(file)).stdout
+    assert keys("revoke", "arm", "--keys", str(file)).exit_code == 0
+    assert "revoked" in keys("list", "--keys", str(file)).stdout
     with pytest.raises(Unauthorized):
         Keys.from_file(file).check(token, "pi0")
 
 
 def test_a_key_may_push_weights_if_it_is_made_for_that(tmp_path: Path) -> None:
     file = tmp_path / "keys.json"
-    tokens = [keys("new", *words, "--file", str(file)).stdout.strip() for words in (["a", "--scope", "weights"], ["b"])]
+    tokens = [keys("new", *words, "--keys", str(file)).stdout.strip() for words in (["a", "--scope", "weights"], ["b"])]
     learner, robot = (Keys.from_file(file).check(token, "pi0") for token in tokens)
     learner.admit(scope="weights")
     robot.admit()
     with pytest.raises(Forbidden, match="lacks the scope 'weights'"):
         robot.admit(scope="weights")
-    assert "weights" in keys("list", "--file", str(file)).stdout
+    assert "weights" in keys("list", "--keys", str(file)).stdout
 
 
 @pytest.mark.parametrize(
@@ -60,7 +60,7 @@ def test_a_key_may_push_weights_if_it_is_made_for_that(tmp_path: Path) -> None:
     ],
 )
 def test_mistakes_are_told_in_a_line(words: list[str], text: str, tmp_path: Path) -> None:
-    done = keys(*words, "--file", str(tmp_path / "keys.json"))
+    done = keys(*words, "--keys", str(tmp_path / "keys.json"))
     assert done.exit_code == 2, done.output
     assert text in " ".join(done.stderr.split())
     assert not (tmp_path / "keys.json").exists()

@@ -31,7 +31,7 @@ def test_a_page_stands_beside_its_results_and_one_of_several_folders_where_it_is
     assert done.stdout.strip() == f"report: {tmp_path / 'a' / 'report.html'}"
     assert (tmp_path / "a" / "report.html").read_text().startswith("<!doctype html>")
     words = [str(tmp_path / "a"), str(tmp_path / "b"), "--inline"]
-    assert report(*words, "--html", str(tmp_path / "pages" / "both.html")).exit_code == 0
+    assert report(*words, "--out", str(tmp_path / "pages" / "both.html")).exit_code == 0
     page = (tmp_path / "pages" / "both.html").read_text()
     assert "data:video/mp4;base64," in page
     assert page.count('id="success"') == 1
@@ -58,4 +58,4 @@ def test_what_is_no_folder_of_results_or_more_than_one_to_watch_is_refused(tmp_p
     done = report(str(tmp_path))
     assert done.exit_code == 2
     assert "want a folder that an evaluation wrote its results to" in done.stderr
-    assert "want one OUT" in report(str(tmp_path), str(tmp_path), "--live").stderr
+    assert "want one FOLDER" in report(str(tmp_path), str(tmp_path), "--live").stderr

@@ -15,7 +15,7 @@ ROOT = Path(__file__).parents[2]
 PAGE = ROOT / "docs" / "cluster" / "slurm.md"
 DOCUMENTED = re.findall(r"^vlagents-ray slurm (.*)$", PAGE.read_text(), re.MULTILINE)
 
-EVAL = ["eval", "tabletop", "--policy", "scripted", "--print"]
+EVAL = ["eval", "tabletop", "--policy", "scripted", "--dry-run"]
 RUNS = """
 policies: [{source: scripted}]
 suites: [{envs: [tabletop], episodes: 2}]
@@ -45,19 +45,19 @@ def test_an_evaluation_keeps_its_words_and_sbatch_gets_the_others(tmp_path: Path
     command = [*EVAL, "--out", str(out), "--nodes", "4", "--gpus-per-node=2", "--resubmit", "3", "--seed", "7"]
     assert {"#SBATCH --nodes=4", "#SBATCH --gpus-per-node=2", "resubmit=3"} <= set(script(*command).splitlines())
     words = ["tabletop", "--policy", "scripted", "--out", str(out), "--seed", "7"]
-    assert arguments(*command) == ["eval", "--fill=1", "--closing=60", "--", *words]
-    assert not out.exists(), "--print writes nothing"
+    assert arguments(*command) == ["eval", "--fill=1", "--closing-s=60", "--", *words]
+    assert not out.exists(), "--dry-run writes nothing"
 
 
 def test_workers_fill_a_job_with_the_cpus_of_each_unless_their_number_is_said(tmp_path: Path) -> None:
     file = tmp_path / "runs.yaml"
     file.write_text(RUNS)
-    for words in (["eval", str(file), "--print"], [*EVAL, "--workers", "2"]):
-        assert arguments(*words, "--out", str(tmp_path / "out"))[:2] == ["eval", "--closing=60"]
+    for words in (["eval", str(file), "--dry-run"], [*EVAL, "--workers", "2"]):
+        assert arguments(*words, "--out", str(tmp_path / "out"))[:2] == ["eval", "--closing-s=60"]
     file.write_text(RUNS.replace("workers: 3", "worker: {cpus: 2}"))
-    assert "--fill=2" in script("eval", str(file), "--print")
+    assert "--fill=2" in script("eval", str(file), "--dry-run")
     file.write_text(RUNS.replace("workers: 3", "worker: {gpus: 0.25}"))
-    refused = slurm("eval", str(file), "--print")
+    refused = slurm("eval", str(file), "--dry-run")
     assert refused.exit_code == 2
     assert "workers" in refused.stderr
 
@@ -68,7 +68,7 @@ def test_tasks_of_an_array_write_to_folders_of_their_own(tmp_path: Path) -> None
     assert "--seed %a00" in printed
 
 
-SERVE = ["serve", "noop", "--print"]
+SERVE = ["serve", "noop", "--dry-run"]
 
 
 @pytest.mark.parametrize(
@@ -101,5 +101,5 @@ def test_a_server_has_a_key_made_for_it_unless_it_has_some() -> None:
 def test_what_the_page_shows_becomes_a_script(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(ROOT)
     for line in DOCUMENTED:
-        assert script(*shlex.split(line), "--print").startswith("#!/bin/bash"), line
+        assert script(*shlex.split(line), "--dry-run").startswith("#!/bin/bash"), line
     assert {line.split()[0] for line in DOCUMENTED} == {"eval", "serve"}

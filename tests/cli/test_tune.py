@@ -73,7 +73,7 @@ def test_a_goal_that_nothing_reaches_is_an_error(file: Path) -> None:
         (["nowhere.yaml"], "nowhere.yaml"),
         (["nowhere.yaml", "--for", "robots"], "--p99-ms"),
         (["nowhere.yaml", "--p99-ms", "60"], "--for robots"),
-        (["FILE", "--state", "joints=some"], "joints"),
+        (["FILE", "--state-dim", "joints=some"], "joints"),
         (["FILE", "--app", "yours"], "mine"),
         (["FILE", "--frames", "."], "trajectory"),
     ],

@@ -94,7 +94,7 @@ def test_a_cancelled_evaluation_is_finished_by_the_same_command_with_each_episod
 def test_a_job_that_is_out_of_time_queues_itself_again_and_goes_on(slurm: Slurm, tmp_path: Path) -> None:
     (tmp_path / "open").touch()
     # It has a second: no episode is begun.
-    job = slurm.vlagents_ray(*command(tmp_path, "--nodes=1", "--time=10", "--closing=599", "--resubmit=5")).strip()
+    job = slurm.vlagents_ray(*command(tmp_path, "--nodes=1", "--time=10", "--closing-s=599", "--resubmit=5")).strip()
     requeued = tmp_path / "out" / "slurm" / job / "requeued"
     slurm.wait_for(job, requeued.exists)
     assert episodes(tmp_path) == []

@@ -31,7 +31,7 @@ def test_every_way_is_measured_and_shared_memory_is_the_fastest_to_a_local_proce
     ray_home: Path, tmp_path: Path
 ) -> None:
     file = tmp_path / "rtt.json"
-    done = bench(ray_home, "rtt", "--peers", "", "--calls", "50", "--json", str(file))
+    done = bench(ray_home, "rtt", "--peers", "", "--calls", "50", "--out", str(file))
     assert done.returncode == 0, done.stdout + done.stderr
     found = json.loads(file.read_text())
     medians = {way["way"]: way["median_ms"] for way in found["ways"]}
@@ -55,7 +55,7 @@ def test_throughput_comes_near_the_bare_policy_and_never_above_it(ray_home: Path
     few = ["--clients", "8", "--batch", "4", "--seconds", "0.6", "--rounds", "1", "--robot-seconds", "0.6"]
     ratios = []
     for _ in range(3):  # a machine that stands still for a second spoils a measurement of 0.6 s
-        done = bench(ray_home, "throughput", *policy, *few, "--transports", "shm,handle", "--json", str(file))
+        done = bench(ray_home, "throughput", *policy, *few, "--transports", "shm,handle", "--out", str(file))
         assert done.returncode == 0, done.stdout + done.stderr
         found = json.loads(file.read_text())
         assert found["ideal_actions_per_s"] == found["bare_rounds"][0]
@@ -78,7 +78,7 @@ def test_peers_make_load_in_the_same_run(ray_home: Path, tmp_path: Path) -> None
     file = tmp_path / "throughput.json"
     few = ["--clients", "1,2", "--batch", "2", "--seconds", "0.5", "--rounds", "2", "--robot-seconds", "1"]
     peers = ["--peers", "openpi,portal", "--peers-python", str(peers_python())]
-    done = bench(ray_home, "throughput", *few, *peers, "--transports", "shm", "--json", str(file))
+    done = bench(ray_home, "throughput", *few, *peers, "--transports", "shm", "--out", str(file))
     assert done.returncode == 0, done.stdout + done.stderr
     found = json.loads(file.read_text())
     assert (set(found["transports"]), set(found["peers"])) == ({"shm"}, {"openpi", "portal"})

@@ -154,10 +154,10 @@ def test_parts_are_merged_exported_and_one_episode_is_played_again(ray_home: Pat
     package = results.runs[0].versions["code"]["vlagents_ray"]
     assert results.policies["scripted"]["code"] == (results.cells[0].code or None) == package
     out = str(tmp_path / "merged")
-    merged = command(ray_home, "merge", out, *map(str, parts))
+    merged = command(ray_home, "merge", *map(str, parts), "--out", out)
     assert merged.returncode == 0, merged.stdout + merged.stderr
     assert "4/4" in merged.stdout
-    exported = command(ray_home, "export", out, str(tmp_path / "dataset"), "--to", "lerobot")
+    exported = command(ray_home, "export", out, "--out", str(tmp_path / "dataset"), "--to", "lerobot")
     assert exported.stdout.startswith("wrote 4 episodes"), exported.stdout + exported.stderr
     key = rows(tmp_path / "merged")[3][0]
     same = command(ray_home, "replay", out, key)

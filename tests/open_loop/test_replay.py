@@ -240,10 +240,10 @@ def policy_file(folder: Path) -> str:
     ("words", "said"),
     [
         (["DATA"], "--policy"),
-        (["DATA", "tabletop#3"], "--episodes"),
-        (["DATA", "--policy", "noop", "--episodes", "3-"], "--episodes"),
-        (["DATA", "--policy", "noop", "--episodes", "7"], "episodes"),
-        (["DATA", "--policy", "noop", "--cameras", "base"], "--cameras"),
+        (["DATA", "tabletop#3"], "--only"),
+        (["DATA", "--policy", "noop", "--only", "3-"], "--only"),
+        (["DATA", "--policy", "noop", "--only", "7"], "episodes"),
+        (["DATA", "--policy", "noop", "--camera-map", "base"], "--camera-map"),
     ],
 )
 def test_wrong_options_are_told(words: list[str], said: str, tmp_path: Path) -> None:

@@ -185,7 +185,7 @@ def test_the_command_checks_a_simulated_arm_without_a_person(
 ) -> None:
     page = tmp_path / "report.html"
     name = f"mujoco:{model_file('franka')}" if status == 0 else "mujoco:missing.xml"
-    assert main([name, "--robot-set", "like=franka", "--robot-set", "fps=5", "--report", str(page)]) == status
+    assert main([name, "--robot-set", "like=franka", "--robot-set", "fps=5", "--out", str(page)]) == status
     said = capsys.readouterr()
     assert ("ok gripper" in said.out, page.exists(), "ConfigError" in said.err) == ((status == 0,) * 2 + (status == 2,))
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import json
 import os
 import sys
 from collections.abc import Iterator
@@ -63,7 +64,7 @@ def errors() -> Iterator[None]:
         from vlagents_ray.evaluate import EvalConfig
         from vlagents_ray.evaluate.exports.scores import HubSettings
 
-        models = {EvalConfig: None, HubSettings: "--set"}  # that users write, and the options that set their fields
+        models = {EvalConfig: None, HubSettings: "--hub-set"}  # that users write, and the options that set their fields
         known = next(((one, option) for one, option in models.items() if one.__name__ == error.title), (None, None))
         fail(f"wrong settings: {wrong_settings(error, *known)}", 2)
     except ConfigError as error:
@@ -98,6 +99,11 @@ def fresh(folder: Path) -> Path:
         number += 1
         candidate = folder.with_name(f"{folder.name}-{number}")
     return candidate
+
+
+def print_json(document: Any) -> None:
+    """Print what `--json` of a command wants, and nothing else, on stdout."""
+    out.print(json.dumps(document, indent=2, default=str))
 
 
 def progress(text: str) -> None:

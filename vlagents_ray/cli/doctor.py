@@ -6,6 +6,7 @@ import errno
 import importlib.metadata
 import json
 import os
+import platform
 import re
 import resource
 import shutil
@@ -14,14 +15,14 @@ import subprocess
 import sys
 import tempfile
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
 from rich.console import Console
 from rich.text import Text
 
-from vlagents_ray.cli.console import table
+from vlagents_ray.cli.console import print_json, table
 from vlagents_ray.errors import MissingDependency
 from vlagents_ray.policies.base.accelerator import OLDEST_DRIVERS, driver_version
 from vlagents_ray.registry import require
@@ -41,7 +42,6 @@ _SESSION_SOCKET = "/ray/session_2026-01-01_00-00-00_000000_1234567/sockets/plasm
 _DISK_FULL = 0.95
 DEFAULT_PORT = 8000
 _FIRST_FREE = 1024  # ports below are root's
-OLDEST_PYTHON = (3, 10)
 _WIDTH = 120  # columns of the table in a file or a pipe
 _STYLE = {"ok": "green", "warn": "yellow", "fail": "bold red"}
 # Prints the versions of torch and JAX in an interpreter, their CUDA, and the GPU that they use or what prevents it.
@@ -171,22 +171,24 @@ def port_free(port: int) -> Check:
     return Check("ok", "free")
 
 
-def run(console: Console, port: int = DEFAULT_PORT, pythons: Sequence[Path] = ()) -> int:
+def run(console: Console, port: int = DEFAULT_PORT, pythons: Sequence[Path] = (), *, as_json: bool = False) -> int:
     """Print a row for each check, see `checks`. Returns the exit code: 1 if any check failed, else 0."""
-    rows = table("check", "", "found", "cure", box=None, header_style="bold", pad_edge=False)
-    failed = False
     with console.status("looking around; rendering a frame takes some seconds"):
-        for name, check in checks(port, pythons):
-            failed |= check.status == "fail"
+        found = list(checks(port, pythons))
+    if as_json:
+        print_json([{"check": name, **asdict(check)} for name, check in found])
+    else:
+        rows = table("check", "", "found", "cure", box=None, header_style="bold", pad_edge=False)
+        for name, check in found:
             rows.add_row(name, Text(check.status, _STYLE[check.status]), Text(check.detail), Text(check.cure))
-    console.print(rows, width=None if console.is_terminal else _WIDTH)
-    return int(failed)
+        console.print(rows, width=None if console.is_terminal else _WIDTH)
+    return int(any(check.status == "fail" for _, check in found))
 
 
 def checks(port: int = DEFAULT_PORT, pythons: Sequence[Path] = ()) -> Iterator[tuple[str, Check]]:
     """Yield names and results of all checks; `pythons` take the place of those that `env make` made in this folder."""
     todo: list[tuple[str, Callable[[], Check]]] = [
-        ("Python", lambda: python(sys.version_info[:3])),
+        ("Python", lambda: Check("ok", f"{platform.python_version()} at {sys.executable}")),
         ("Ray", ray),
         ("HAProxy", haproxy),
         ("GPU", gpu),
@@ -213,15 +215,6 @@ def guarded(check: Callable[[], Check]) -> Check:
         return Check("warn", found, cure)
     except Exception as error:  # noqa: BLE001 - drivers and codecs raise anything; the other rows still matter
         return Check("warn", f"the check itself broke: {type(error).__name__}: {error}", "please report this")
-
-
-def python(version: tuple[int, ...]) -> Check:
-    """Check that the package supports this Python, (major, minor, micro)."""
-    detail = f"{'.'.join(map(str, version))} at {sys.executable}"
-    if version[:2] >= OLDEST_PYTHON:
-        return Check("ok", detail)
-    oldest = ".".join(map(str, OLDEST_PYTHON))
-    return Check("fail", detail, f"install Python {oldest} or newer; `make setup` uses 3.11")
 
 
 def ray() -> Check:

@@ -65,7 +65,7 @@ class EvalOptions:
     video: Annotated[str | None, typer.Option(help="none, failures (default) or all.")] = None
     record: Annotated[str | None, typer.Option(help="Trajectories: none (default), failures or all.")] = None
     track: Annotated[str, typer.Option(help="wandb, trackio, tensorboard, with commas between them.")] = ""
-    resume: Annotated[bool, typer.Option(help="Go on with the results in --out.")] = False
+    resume: Annotated[bool, typer.Option("--resume", help="Go on with the results in --out.")] = False
     accept_changes: Annotated[
         bool,
         typer.Option("--accept-changes", help="With --resume: although files or weights changed; the report says so."),
@@ -85,7 +85,7 @@ class EvalOptions:
         typer.Option(metavar="DIR", help="Evaluate each checkpoint that a training run writes there, until Ctrl-C."),
     ] = None
     until: Annotated[int | None, typer.Option(min=0, metavar="STEP", help="End --watch with this step.")] = None
-    settle: Annotated[float | None, typer.Option(min=0, help="With --watch: s without a change; default: 10.")] = None
+    settle_s: Annotated[float | None, typer.Option(min=0, help="With --watch: without a change; default: 10.")] = None
     marker: Annotated[str | None, typer.Option(metavar="NAME", help="With --watch: the trainer's last file.")] = None
     dry_run: Annotated[bool, typer.Option("--dry-run", help="Print the plan, and the time left; play nothing.")] = False
     end_at: Annotated[
@@ -120,7 +120,7 @@ class EvalOptions:
 
     def require_together(self, *, on_robot: bool) -> None:
         """Raise `ConfigError` for options that need another one, or that exclude one another."""
-        if self.watch is None and (needing := self.given("until", "settle", "marker")):
+        if self.watch is None and (needing := self.given("until", "settle_s", "marker")):
             raise ConfigError(f"got {needing} without --watch")
         if self.dry_run and self.watch is not None:
             raise ConfigError("--dry-run and --watch exclude each other: the steps of the training are not known yet")
@@ -162,7 +162,7 @@ def evaluate_command(options: EvalOptions) -> None:
             with quiet_ray(None):
                 print_plan(config)
         elif options.watch is not None:
-            settle_s = 10.0 if options.settle is None else options.settle
+            settle_s = 10.0 if options.settle_s is None else options.settle_s
             watch_training(
                 config, options.watch, address, until=options.until, settle_s=settle_s, marker=options.marker, live=page
             )

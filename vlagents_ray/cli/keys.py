@@ -17,7 +17,7 @@ from vlagents_ray.serve.access.key_store import new_key, read_keys, revoke
 
 keys = typer.Typer(no_args_is_help=True, help="The API keys of a server: make, list and revoke them.")
 File = Annotated[
-    Path | None, typer.Option("--file", help=f"The key file; default: {FILE_VARIABLE}, or keys.json in this folder.")
+    Path | None, typer.Option("--keys", help=f"The key file; default: {FILE_VARIABLE}, or keys.json in this folder.")
 ]
 Name = Annotated[str, typer.Argument(help="Who has the key: arm-1, lab, …")]
 _DAY_S = 86_400
@@ -79,5 +79,5 @@ def _file(file: Path | None) -> Path:
 def _existing(file: Path | None) -> Path:
     place = _file(file)
     if not place.is_file():
-        raise ConfigError(f"keys file {place} does not exist; `vlagents-ray keys new NAME --file {place}` makes it")
+        raise ConfigError(f"keys file {place} does not exist; `vlagents-ray keys new NAME --keys {place}` makes it")
     return place

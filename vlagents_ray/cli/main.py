@@ -11,10 +11,11 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from vlagents_ray.cli import results
-from vlagents_ray.cli.console import errors, fail, fresh, out, progress, table
+from vlagents_ray.cli.console import errors, fail, fresh, out, print_json, progress, table
 from vlagents_ray.cli.evaluate import evaluate_command
 from vlagents_ray.cli.keys import keys
 from vlagents_ray.cli.new import new
+from vlagents_ray.cli.options import AsJson
 from vlagents_ray.cli.serve import serve_command
 from vlagents_ray.cli.slurm import slurm
 from vlagents_ray.cli.tune import tune_command
@@ -24,7 +25,6 @@ if TYPE_CHECKING:
     from vlagents_ray.cli.listing import Listed
 
 OneName = Annotated[str | None, typer.Argument(metavar="[NAME]", help="Say all about this one alone.")]
-AsJson = Annotated[bool, typer.Option("--json", help="As JSON, for programs.")]
 
 app = typer.Typer(
     no_args_is_help=True,
@@ -75,11 +75,12 @@ def demo(out_dir: Annotated[Path, typer.Option("--out", help="Folder of the resu
 def doctor(
     port: Annotated[int, typer.Option(help="The port that a server would take.")] = 8000,
     python: Annotated[list[Path], typer.Option(help="A policy's Python, repeatable; default: in .venv-*.")] = [],  # noqa: B006
+    as_json: AsJson = False,
 ) -> None:
     """Check this machine: Python, Ray, GPU, torch, JAX, rendering, shared memory, ports; each with the cure."""
     from vlagents_ray.cli.doctor import run
 
-    raise typer.Exit(run(out, port, python))
+    raise typer.Exit(run(out, port, python, as_json=as_json))
 
 
 # With lines that fit into 80 columns, so that all commands are on one screen.
@@ -125,7 +126,7 @@ def _list(listed: Sequence[Listed], name: str | None, *, as_json: bool) -> None:
     if not (chosen := [one for one in listed if name in (None, one.name)]):
         fail(f"{name!r} is not registered{did_you_mean(str(name), [one.name for one in listed])}", 2)
     if as_json:
-        out.print(json.dumps([asdict(one) for one in chosen], indent=2, default=str))
+        print_json([asdict(one) for one in chosen])
         return
     if name is not None:
         for line in chosen[0].lines():
@@ -143,15 +144,10 @@ def _list(listed: Sequence[Listed], name: str | None, *, as_json: bool) -> None:
         out.print(f"  {line}")
 
 
-@env.callback()
-def _group() -> None:
-    """Keep `make` a subcommand."""
-
-
 @env.command("make")
 def make(
     requirements: Annotated[Path, typer.Argument(help="A requirements file: requirements/lerobot.txt.")],
-    into: Annotated[Path | None, typer.Option(help="Folder; default: .venv- and the file's name.")] = None,
+    out_dir: Annotated[Path | None, typer.Option("--out", help="Folder; default: .venv- and the file's name.")] = None,
     more: Annotated[list[Path], typer.Option("--with", help="A further requirements file, repeatable.")] = [],  # noqa: B006
     python: Annotated[str | None, typer.Option(help="Version or interpreter; default: the file's, or this.")] = None,
     light: Annotated[bool, typer.Option("--light", help="Without Ray, for a child process.")] = False,
@@ -160,7 +156,7 @@ def make(
     """Make a virtual environment with this vlagents-ray and a policy's requirements, and print how to use it."""
     from vlagents_ray.serve.python_env.create import make_environment
 
-    folder = into or Path(f".venv-{requirements.stem}")
+    folder = out_dir or Path(f".venv-{requirements.stem}")
     with errors():
         made = make_environment(
             requirements, folder, more=more, python=python, light=light, cuda=cuda, progress=progress

@@ -26,6 +26,7 @@ Address = Annotated[
     ),
 ]
 
+AsJson = Annotated[bool, typer.Option("--json", help="As JSON, for programs.")]
 Live = Annotated[
     bool, typer.Option("--live", help="Serve a page in the browser that fills up as it runs, on 127.0.0.1:8050.")
 ]
@@ -35,7 +36,7 @@ LiveAt = Annotated[
 ]
 
 StateDims = Annotated[
-    list[str], typer.Option("--state", metavar="PART=N", help="Numbers in a part for which the policy does not say.")
+    list[str], typer.Option("--state-dim", metavar="PART=N", help="Numbers in a part, where the policy does not say.")
 ]
 _Options = TypeVar("_Options")
 

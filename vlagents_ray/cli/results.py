@@ -3,50 +3,64 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from vlagents_ray.cli.console import errors, fresh, out, table
-from vlagents_ray.cli.options import Address, Live, LiveAt, parse_list, parse_settings
+from vlagents_ray.cli.console import errors, fresh, out, print_json, table
+from vlagents_ray.cli.options import Address, AsJson, Live, LiveAt, parse_list, parse_settings
 from vlagents_ray.errors import ConfigError
 
 if TYPE_CHECKING:
     from vlagents_ray.open_loop import ReplayPlan
 
+Folder = Annotated[Path, typer.Argument(metavar="FOLDER", help="Folder of results.")]
+
 
 def report_command(
-    folders: Annotated[list[Path], typer.Argument(metavar="OUT...", help="Folders that evaluations wrote to.")],
-    html: Annotated[Path | None, typer.Option(help="Default: report.html in OUT; of several folders, here.")] = None,
+    folders: Annotated[list[Path], typer.Argument(metavar="FOLDER...", help="Folders of results.")],
+    path: Annotated[
+        Path | None, typer.Option("--out", help="Default: report.html in FOLDER; of several, here.")
+    ] = None,
     inline: Annotated[bool, typer.Option("--inline", help="With videos in the page, as far as they fit.")] = False,
+    as_json: AsJson = False,
     live: Live = False,
     live_at: LiveAt = None,
 ) -> None:
     """Write the report: success with intervals, comparisons, latency, failures, and settings.
 
-    With --live it shows the results in OUT as another process adds to them, until Ctrl-C, and writes no report.
+    With --live it shows the results in FOLDER as another process adds to them, until Ctrl-C, and writes no report.
     """
     from vlagents_ray.evaluate import Results
     from vlagents_ray.evaluate.merge import combined
     from vlagents_ray.evaluate.report.page import FILE, write_report
+    from vlagents_ray.evaluate.results.comparison import comparable, comparisons
+    from vlagents_ray.evaluate.results.summary import summarize
 
     with errors():
         if live or live_at:
             from vlagents_ray.cli.evaluation import follow, live_address
 
-            if len(folders) != 1 or html is not None:
-                raise ConfigError("--live shows one folder, and writes no file: want one OUT, and no --html")
+            if len(folders) != 1 or path is not None or as_json:
+                raise ConfigError(
+                    "--live shows one folder, and writes nothing: want one FOLDER, no --out and no --json"
+                )
             follow(folders[0], live_address(live_at))
             return
         results = combined([Results.load(folder) for folder in folders])
-        path = html or (folders[0] / FILE if len(folders) == 1 else Path(FILE))
+        if as_json:
+            found = comparisons(results, comparable(results)[0])
+            print_json(summarize(results).to_json() | {"comparisons": [one.to_json() for one in found]})
+            return
+        path = path or (folders[0] / FILE if len(folders) == 1 else Path(FILE))
         out.print(f"report: {write_report(results, path, inline=inline)}")
 
 
 def export_command(
-    folder: Annotated[Path, typer.Argument(metavar="OUT", help="Folder of the results.")],
-    path: Annotated[Path, typer.Argument(metavar="PATH", help="File to write; of lerobot and hub, a new folder.")],
+    folder: Folder,
+    path: Annotated[Path, typer.Option("--out", help="File to write; of lerobot and hub, a new folder.")],
     to: Annotated[
         str,
         typer.Option(
@@ -67,7 +81,7 @@ def export_command(
     ] = False,
     settings: Annotated[
         list[str],
-        typer.Option("--set", metavar="KEY=VALUE", help="hub: dataset=OWNER/NAME, …"),
+        typer.Option("--hub-set", metavar="KEY=VALUE", help="hub: dataset=OWNER/NAME, …"),
     ] = [],  # noqa: B006 - typer reads it
 ) -> None:
     """Write the episodes of an evaluation as JSON, CSV, Parquet or a LeRobotDataset v3.0; or its scores, to publish."""
@@ -85,8 +99,8 @@ def export_command(
             given = ", ".join(f"--{name.replace('_', '-')}" for name in chosen)
             raise ConfigError(f"{given}: got --to {to}, want --to lerobot, whose frames they choose")
         if settings and to != "hub":
-            raise ConfigError(f"--set: got --to {to}, want --to hub, whose scores they describe")
-        chosen |= parse_settings(settings, "--set")
+            raise ConfigError(f"--hub-set: got --to {to}, want --to hub, whose scores they describe")
+        chosen |= parse_settings(settings, "--hub-set")
         results = Results.load(folder).only(policy, env)
         with storing(path.parent):
             number = EXPORTS[to](results, path, **chosen)
@@ -94,8 +108,8 @@ def export_command(
 
 
 def merge_command(
-    into: Annotated[Path, typer.Argument(metavar="OUT", help="New folder.")],
     folders: Annotated[list[Path], typer.Argument(metavar="FOLDER...", help="Folders of results, which stay.")],
+    into: Annotated[Path, typer.Option("--out", help="New folder.")],
     keep_first: Annotated[
         bool, typer.Option("--keep-first", help="Of different outcomes of an episode keep that of the first folder.")
     ] = False,
@@ -112,8 +126,8 @@ def merge_command(
 
 
 def bundle_command(
-    folder: Annotated[Path, typer.Argument(metavar="OUT", help="Folder of the results.")],
-    file: Annotated[Path | None, typer.Option("--out", help="The file; default: OUT.bundle.zip beside OUT.")] = None,
+    folder: Folder,
+    file: Annotated[Path | None, typer.Option("--out", help="The file; default: FOLDER.bundle.zip.")] = None,
     videos: Annotated[bool, typer.Option("--videos", help="With its videos, which may be large.")] = False,
 ) -> None:
     """Write an evaluation as one file: database, differences from commits, trajectories, digests."""
@@ -128,9 +142,10 @@ def bundle_command(
 def verify_command(
     bundle: Annotated[Path, typer.Argument(metavar="BUNDLE", help="A file that `vlagents-ray bundle` wrote.")],
     replay: Annotated[int, typer.Option(min=0, help="Episodes whose recorded actions are played again.")] = 3,
-    into: Annotated[Path | None, typer.Option(help="Keep its results in this new folder.")] = None,
+    into: Annotated[Path | None, typer.Option("--out", help="Keep its results in this new folder.")] = None,
     trust: Annotated[bool, typer.Option("--trust", help="Also make environments that name code or files.")] = False,
-    most_gb: Annotated[float, typer.Option(min=0, help="Refuse a bundle that unpacks to more.")] = 16.0,
+    max_gb: Annotated[float, typer.Option(min=0, help="Refuse a bundle that unpacks to more.")] = 16.0,
+    as_json: AsJson = False,
 ) -> None:
     """Check a bundle, also a stranger's, and print what is equal, differs, or could not be checked.
 
@@ -140,14 +155,17 @@ def verify_command(
     from vlagents_ray.evaluate.bundle import verify
 
     with errors():
-        found = verify(bundle, into=into, replay=replay, trust=trust, most_bytes=int(most_gb * 1e9))
-        rows = table("what", "found", "detail", box=None)
-        for one in found.findings:
-            rows.add_row(one.subject, one.verdict, one.detail)
-        out.print(rows)
-        out.print(f"\nbundle sha256:{found.digest}: {'holds' if found.holds else 'is contradicted'}")
-        if into is not None:
-            out.print(f"results: {into}")
+        found = verify(bundle, into=into, replay=replay, trust=trust, most_bytes=int(max_gb * 1e9))
+        if as_json:
+            print_json({"holds": found.holds, **asdict(found)})
+        else:
+            rows = table("what", "found", "detail", box=None)
+            for one in found.findings:
+                rows.add_row(one.subject, one.verdict, one.detail)
+            out.print(rows)
+            out.print(f"\nbundle sha256:{found.digest}: {'holds' if found.holds else 'is contradicted'}")
+            if into is not None:
+                out.print(f"results: {into}")
     raise typer.Exit(not found.holds)
 
 
@@ -159,11 +177,11 @@ def replay_command(
     policy: Annotated[str | None, typer.Option(help="Name, deployment file, or URL; default: the run's own.")] = None,
     out_dir: Annotated[Path | None, typer.Option("--out", help="Folder of the replay; default: a new one.")] = None,
     address: Address = None,
-    episodes: Annotated[str | None, typer.Option(help="Of a dataset: these, as 0-9,12. Default: all.")] = None,
+    only: Annotated[str | None, typer.Option(help="Of a dataset: episodes, as 0-9,12. Default: all.")] = None,
     horizon: Annotated[int | None, typer.Option(min=1, help="Of a dataset: rows of a chunk that are compared.")] = None,
     every: Annotated[int, typer.Option(min=1, help="Of a dataset without answers: each so many-th frame.")] = 1,
     at_once: Annotated[int, typer.Option(min=1, help="Of a dataset: episodes that share a batch.")] = 8,
-    cameras: Annotated[str | None, typer.Option(help="Of a dataset: POLICY=DATASET, as base=top,wrist=left.")] = None,
+    camera_map: Annotated[str | None, typer.Option(help="Of a dataset: POLICY=DATASET, as base=top.")] = None,
     state: Annotated[str | None, typer.Option(help="Of a dataset: parts of observation.state in order.")] = None,
 ) -> None:
     """Play an episode of an evaluation again: exit code 0 if all is the same. Or play a dataset to another policy.
@@ -174,15 +192,15 @@ def replay_command(
     with errors():
         if (folder / "meta/info.json").is_file() or any(folder.glob("*/meta/info.json")):
             if episode is not None:
-                raise ConfigError(f"{folder}: is a dataset, got {episode!r}; want --episodes, or none of it")
+                raise ConfigError(f"{folder}: is a dataset, got {episode!r}; want --only, or none of it")
             if policy is None:
                 raise ConfigError(f"{folder}: is a dataset: want --policy, a name, a deployment file or a URL")
             from vlagents_ray.open_loop import Names, ReplayPlan
 
-            chosen = None if episodes is None else parse_episodes(episodes)
-            pairs = [part.partition("=") for part in parse_list(cameras or "")]
+            chosen = None if only is None else parse_episodes(only)
+            pairs = [part.partition("=") for part in parse_list(camera_map or "")]
             if odd := [name for name, equals, _ in pairs if not equals]:
-                raise ConfigError(f"--cameras: got {odd[0]!r}, want POLICY=DATASET, such as base=top,wrist=wrist_left")
+                raise ConfigError(f"--camera-map: got {odd[0]!r}, want POLICY=DATASET, such as base=top,wrist=left")
             renamed = {name: camera for name, _, camera in pairs}
             names = Names(renamed, None if state is None else parse_list(state))
             plan = ReplayPlan(chosen, horizon, every, at_once, names)
@@ -230,6 +248,6 @@ def parse_episodes(text: str) -> Sequence[int]:
     for part in parse_list(text):
         first, dash, last = part.partition("-")
         if not first.isdecimal() or (dash and not last.isdecimal()):
-            raise ConfigError(f"--episodes: got {part!r}, want numbers and ranges, such as 0-9,12")
+            raise ConfigError(f"--only: got {part!r}, want numbers and ranges, such as 0-9,12")
         found += range(int(first), int(last or first) + 1)
     return found

@@ -124,10 +124,14 @@ def _run(options: argparse.Namespace) -> LoopReport:
         stated = contract is not None and contract.action.relative is not None
         if options.safe == "auto" and not options.robot and topics is None and not stated:
             options.safe = "hold"  # the simulated robot uses such actions as absolute targets
-        given = named(options, "mode", "execute", "merge", "horizon", "max_age_s", "safe")
-        settings = PlayerSettings(real_time_chunking=options.rtc, deadline_s=deadline_s, **given)
-        motion = named(options, "max_step", "limits", "soft_start_s")
-        guard = Guard(contract, measure=measured_state(options.measure), hz=hz, **motion)
+        settings = PlayerSettings(
+            options.mode, options.execute, merge=options.merge, horizon=options.horizon, safe=options.safe,
+            max_age_s=options.max_age_s, deadline_s=deadline_s, real_time_chunking=options.rtc,
+        )  # fmt: skip
+        guard = Guard(
+            contract, max_step=options.max_step, measure=measured_state(options.measure), limits=options.limits, hz=hz,
+            soft_start_s=options.soft_start_s,
+        )  # fmt: skip
         player = stack.enter_context(ChunkPlayer(agent, settings, check=guard, override=leader))
         player.initialize()  # refuses unfit settings before anything is timed or moves
         robot: Robot = topics or (SimulatedRobot(contract) if make_robot is None else make_robot())
@@ -150,10 +154,11 @@ def _run(options: argparse.Namespace) -> LoopReport:
         if topics is not None:
             topics.watchdog = watchdog
         stack.enter_context(_restarting(watchdog, say))
-        given = named(options, "instruction", "seconds", "restart", "real_time")
         report = run_loop(
-            robot, player, hz=hz, watchdog=watchdog, recorder=recorder, viewer=viewer, commands=commands, **given
-        )
+            robot, player, hz=hz, watchdog=watchdog, recorder=recorder, viewer=viewer, commands=commands,
+            instruction=options.instruction, seconds=options.seconds, restart=options.restart,
+            real_time=options.real_time,
+        )  # fmt: skip
         if report.outcome:
             say(f"marked as a {report.outcome} on the live page")
         say(_line(_HEADER))
@@ -167,11 +172,6 @@ def _run(options: argparse.Namespace) -> LoopReport:
     if viewer is not None:
         say(viewer.report())
     return report
-
-
-def named(options: argparse.Namespace, *names: str) -> dict[str, Any]:
-    """Return the options that are arguments of the same names elsewhere."""
-    return {name: getattr(options, name) for name in names}
 
 
 def _require_fit(

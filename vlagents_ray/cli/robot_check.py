@@ -10,9 +10,11 @@ from __future__ import annotations
 
 import argparse
 import contextlib
+import json
 import sys
 import time
 from collections.abc import Sequence
+from dataclasses import asdict, replace
 
 from vlagents_ray.client.agent import RemoteAgent
 from vlagents_ray.errors import VLAgentsError
@@ -34,10 +36,14 @@ def main(arguments: Sequence[str]) -> int:
     except VLAgentsError as error:
         print(f"{type(error).__name__}: {error}", file=sys.stderr)  # noqa: T201
         return 2
-    print("\n".join(report.lines()))  # noqa: T201
-    if options.report:
-        report.write(options.report)
-        print(f"report: {options.report}")  # noqa: T201
+    if options.json:
+        document = {"ok": report.ok, **asdict(replace(report, pictures={}))}
+        print(json.dumps(document, indent=2))  # noqa: T201
+    else:
+        print("\n".join(report.lines()))  # noqa: T201
+    if options.out:
+        report.write(options.out)
+        print(f"report: {options.out}", file=sys.stderr)  # noqa: T201
     return 0 if report.ok else 1
 
 
@@ -72,5 +78,6 @@ def command_parser() -> argparse.ArgumentParser:
     add("--policy", metavar="URL", help="check by the contract of the policy of this server, not by the robot's own")
     add("--hz", type=float, help="control rate (default: the contract's, or 50)")
     add("--latency-ms", type=float, default=400.0, help="longest time from command to motion (%(default)s)")
-    add("--report", metavar="FILE", help="write the report with pictures as an HTML page")
+    add("--out", metavar="FILE", help="write the report with pictures as an HTML page")
+    add("--json", action="store_true", help="as JSON, for programs")
     return parser

@@ -25,7 +25,7 @@ slurm = typer.Typer(
 _BOTH = {"allow_extra_args": True, "ignore_unknown_options": True}
 _FOUND_OUT = "it finds that out for itself"
 _TASK = "%a"  # the number of a task of --array, as in sbatch's file names
-Print = Annotated[bool, typer.Option("--print", help="Print the script; write and submit nothing.")]
+DryRun = Annotated[bool, typer.Option("--dry-run", help="Print the script; write and submit nothing.")]
 Parsable = Annotated[bool, typer.Option("--parsable", help="Print the job's number and nothing else.")]
 Setup = Annotated[Path | None, typer.Option(help="File of shell lines that the job begins with: module load, export.")]
 
@@ -34,9 +34,9 @@ Setup = Annotated[Path | None, typer.Option(help="File of shell lines that the j
 def eval_(
     context: typer.Context,
     resubmit: Annotated[int, typer.Option(min=0, help="Times that the job, out of time, queues itself again.")] = 0,
-    closing: Annotated[float, typer.Option(min=0, metavar="S", help="End so long before the job's time does.")] = 60.0,
+    closing_s: Annotated[float, typer.Option(min=0, help="End so long before the job's time does.")] = 60.0,
     setup: Setup = None,
-    print_only: Print = False,
+    dry_run: DryRun = False,
     parsable: Parsable = False,
 ) -> None:
     """Evaluate in a job, with the options of `vlagents-ray eval` (see its --help) and sbatch's.
@@ -60,8 +60,8 @@ def eval_(
                 )
             fill = [f"--fill={max(1.0, most_cpus(config)):g}"]
         folder = Path(os.path.commonpath([config.out, other.out])) / "slurm"  # of an array: above its tasks
-        arguments = ["eval", *fill, f"--closing={closing:g}", "--", *words]
-        _submit(Script("eval", folder, arguments, options, resubmit, setup), print_only, parsable)
+        arguments = ["eval", *fill, f"--closing-s={closing_s:g}", "--", *words]
+        _submit(Script("eval", folder, arguments, options, resubmit, setup), dry_run, parsable)
 
 
 @slurm.command("serve", context_settings=_BOTH, options_metavar="POLICY [OPTIONS]")
@@ -71,7 +71,7 @@ def serve(
         Path | None, typer.Option("--out", help="Folder of script, logs, and server.json; default: runs/serve/POLICY.")
     ] = None,
     setup: Setup = None,
-    print_only: Print = False,
+    dry_run: DryRun = False,
     parsable: Parsable = False,
 ) -> None:
     """Serve a policy in a job, with the options of `vlagents-ray serve` (see its --help) and sbatch's.
@@ -93,11 +93,11 @@ def serve(
         arguments = ["serve", *(f"--app={name}={route}" for name, route in apps.items())]
         arguments += [] if given["port"] is None else [f"--port={given['port']}"]
         arguments += ["--key"] if given["keys"] is None and not given["insecure"] else []
-        _submit(Script("serve", folder, [*arguments, "--", *words], options, setup=setup), print_only, parsable)
+        _submit(Script("serve", folder, [*arguments, "--", *words], options, setup=setup), dry_run, parsable)
 
 
-def _submit(script: Script, print_only: bool, parsable: bool) -> None:
-    if print_only:
+def _submit(script: Script, dry_run: bool, parsable: bool) -> None:
+    if dry_run:
         typer.echo(script.text(), nl=False)
         return
     job = submit(script)
@@ -146,7 +146,6 @@ def _evaluation(words: list[str]) -> EvalConfig:
 
     given = _parsed("eval", evaluate_command, words)
     _refuse(given, _FOUND_OUT, "address", "end_at")
-    _refuse(given, "`vlagents-ray eval --dry-run` plans without one", "dry_run")
     _refuse(given, "it would wait for a training; have that submit each checkpoint (`submit_evaluation`)", "watch")
     config = config_from_options(EvalOptions(**given))
     cells(resolve_policies(config, ask=False)[0])

@@ -55,7 +55,7 @@ def tune_command(
         args = ServerArgs(**application.args)
         plan = TunePlan(
             args, goal, max_batch, minutes, seconds, tolerance, None if dtypes is None else parse_list(dtypes), frames,
-            image, parse_dims(state, "--state"),
+            image, parse_dims(state, "--state-dim"),
         )  # fmt: skip
         tuner = Tuner(plan, progress, began)
         points = tuner.measure()

@@ -169,7 +169,7 @@ def _checked(archive: Path, file: zipfile.ZipFile, most_bytes: int) -> dict[str,
         members[name] = member
     if (total := sum(member.file_size for member in listed)) > most_bytes:
         raise ConfigError(
-            f"{archive}: unpacks to {total} bytes, want at most {most_bytes}; allow more with --most-gb if you trust it"
+            f"{archive}: unpacks to {total} bytes, want at most {most_bytes}; allow more with --max-gb if you trust it"
         )
     return members
 

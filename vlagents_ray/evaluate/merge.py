@@ -245,8 +245,8 @@ def combined(folders: Sequence[Results]) -> Results:
             if (first := seen.setdefault(cell.cell, each.out)) is not each.out:
                 raise ConfigError(
                     f"report: {first} and {each.out} both have {cell.contender!r} in {cell.env!r} with the same "
-                    f"settings; put parts of one evaluation into one folder first: `vlagents-ray merge OUT {first} "
-                    f"{each.out}`, with --accept-changes if code or weights changed between them"
+                    f"settings; put parts of one evaluation into one folder first: `vlagents-ray merge {first} "
+                    f"{each.out} --out OUT`, with --accept-changes if code or weights changed between them"
                 )
     every = [cell for each in folders for cell in each.cells]
     counts = Counter((cell.contender, cell.suite, cell.env) for cell in every)

@@ -163,7 +163,7 @@ def run_command(arguments: Sequence[str]) -> None:
     parser = argparse.ArgumentParser()
     parser.add_argument("what", choices=["eval", "serve"])
     parser.add_argument("--fill", type=float, metavar="CPUS", help="workers of so many CPUs each, on all but one")
-    parser.add_argument("--closing", type=float, default=0.0, help="s before the job's end, to end in order")
+    parser.add_argument("--closing-s", type=float, default=0.0, help="s before the job's end, to end in order")
     parser.add_argument("--key", action="store_true", help="create an API key")
     parser.add_argument("--port", type=int, help="port of the server; by default derived from the job's number")
     parser.add_argument("--app", action="append", default=[], help="an application and its route")

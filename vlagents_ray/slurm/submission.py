@@ -172,7 +172,7 @@ def submit(script: Script) -> str:
         )  # fmt: skip
     except FileNotFoundError as error:
         raise ConfigError(
-            f"sbatch is not installed here: run this where jobs are submitted, or copy {file} there (--print shows it)"
+            f"sbatch is not installed here: run it where jobs are submitted, or copy {file} there (--dry-run shows it)"
         ) from error
     except subprocess.TimeoutExpired as error:
         raise SubmissionFailed(f"sbatch {file}: no answer in {_SBATCH_S:g} s; look with `squeue --me`") from error

@@ -95,7 +95,7 @@ def require_fit(policy: Contract | None, here: Contract) -> None:
         require_match(policy, here)
     except ContractMismatch as error:
         raise ContractMismatch(
-            f"{error}\nThe env is what this command drives. --policy.cameras='{{POLICYS: ROBOTS, …}}' renames cameras, "
+            f"{error}\nThe env is what this command drives. --policy.cameras='{{POLICY: ROBOT, …}}' renames cameras, "
             f"{_STATE_OPTION} names the parts of observation.state, --dataset.fps is the control rate."
         ) from error
 

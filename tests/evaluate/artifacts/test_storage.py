@@ -175,9 +175,9 @@ def test_reports_merges_and_exports_tell_a_read_only_folder_alike(config: Config
     out, target = str(config().out), tmp_path / "target"
     target.mkdir()
     for words in (
-        ["report", out, "--html", f"{target}/x.html"],
-        ["merge", f"{target}/new", out],
-        ["export", out, f"{target}/x.csv", "--to", "csv"],
+        ["report", out, "--out", f"{target}/x.html"],
+        ["merge", out, "--out", f"{target}/new"],
+        ["export", out, "--out", f"{target}/x.csv", "--to", "csv"],
     ):
         done = python_on(READ_ONLY, target, WRITE, *words)
         assert done.stdout.startswith("1 SystemExit(1)"), done.stdout + done.stderr

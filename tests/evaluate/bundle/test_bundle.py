@@ -263,7 +263,7 @@ def test_links_duplicates_and_archives_that_unpack_to_too_much_are_refused(bundl
             file.writestr(member, text)
         with pytest.raises(ConfigError, match=why):
             verify(hostile)
-    with pytest.raises(ConfigError, match=r"unpacks to \d+ bytes, want at most 1000; allow more with --most-gb"):
+    with pytest.raises(ConfigError, match=r"unpacks to \d+ bytes, want at most 1000; allow more with --max-gb"):
         verify(bundle, most_bytes=1000)
 
 
@@ -337,7 +337,7 @@ def test_the_commands_say_what_to_cite_and_end_with_1_if_something_differs(table
     code, said = run("bundle", tabletop, "--out", file)
     digest = said.rpartition("sha256:")[2]
     assert (code, len(digest)) == (0, 64)
-    code, said = run("verify", file, "--replay", 0, "--into", tmp_path / "kept")
+    code, said = run("verify", file, "--replay", 0, "--out", tmp_path / "kept")
     assert code == 0
     assert f"bundle sha256:{digest}: holds results: {tmp_path / 'kept'}" in said
     name = recording(file)
@@ -345,6 +345,6 @@ def test_the_commands_say_what_to_cite_and_end_with_1_if_something_differs(table
     code, said = run("verify", forged, "--replay", 0)
     assert code == 1
     assert f"bundle sha256:{digest}: is contradicted" in said
-    code, said = run("verify", file, "--most-gb", "0.000001")
+    code, said = run("verify", file, "--max-gb", "0.000001")
     assert code == 2
-    assert "allow more with --most-gb if you trust it" in said
+    assert "allow more with --max-gb if you trust it" in said

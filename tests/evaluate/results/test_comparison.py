@@ -117,9 +117,7 @@ def test_other_weights_under_one_name_are_told_apart_by_their_folders(tmp_path: 
 
 
 def test_parts_of_one_evaluation_are_to_be_merged(tmp_path: Path) -> None:
-    with pytest.raises(
-        ConfigError, match=r"vlagents-ray merge OUT .* with --accept-changes if code or weights changed"
-    ):
+    with pytest.raises(ConfigError, match=r"merge .* --out OUT`, with --accept-changes if code or weights changed"):
         combined([folder(tmp_path / "a", "pi0"), folder(tmp_path / "b", "pi0")])
 
 

@@ -114,8 +114,8 @@ def test_the_documented_commands_lead_from_recordings_to_a_policy_that_acts(rout
     task, options = record[0], settings_of(record, "--env-set")
     run = flat_config(envs=[task], env_options=options, episodes=2, record="all", video="none", out=tmp_path / "run")
     play(run, Scripted)
-    _, _, *chosen = documented("vlagents-ray export")[route]
-    exported = CliRunner().invoke(app, ["export", str(tmp_path / "run"), str(tmp_path / "dataset"), *chosen])
+    _, _, _, *chosen = documented("vlagents-ray export")[route]
+    exported = CliRunner().invoke(app, ["export", str(tmp_path / "run"), "--out", str(tmp_path / "dataset"), *chosen])
     assert exported.exit_code == 0, exported.output
     policy = served(train(tmp_path / "dataset", tmp_path / "act", route))
     assert watched[route][0] == task

@@ -102,7 +102,7 @@ def test_no_such_interpreter(tmp_path: Path) -> None:
             continue
         with pytest.raises(ConfigError) as caught:
             probe(str(tmp_path / python))
-        [(requirements, folder)] = re.findall(r"`vlagents-ray env make (\S+) --into (\S+)`", str(caught.value))
+        [(requirements, folder)] = re.findall(r"`vlagents-ray env make (\S+) --out (\S+)`", str(caught.value))
         assert (ROOT / requirements).is_file()
         assert Path(folder, "bin/python") == tmp_path / python
     (tmp_path / "bin").mkdir()

@@ -371,7 +371,7 @@ def require_access(host: str, keys: Keys | None, insecure: bool) -> None:
     if keys is None and not insecure and not is_loopback(host):
         raise ConfigError(
             f"host {host}: any client that reaches this server could command the policy. Make keys "
-            f"(`vlagents-ray keys new NAME --file keys.json`) and serve with `--keys keys.json` (in a deployment file: "
+            f"(`vlagents-ray keys new NAME --keys keys.json`) and serve with `--keys keys.json` (in a deployment file: "
             f"`access: {{keys_file: PATH}}` under `args`); or say `--insecure` (`access: {{insecure: true}}`)"
         )
 

@@ -113,7 +113,7 @@ def _making(python: str) -> str:
     prefix, _, name = folder.name.partition(".venv-")
     if prefix or not name:
         return "vlagents-ray env make REQUIREMENTS"
-    return f"vlagents-ray env make requirements/{name}.txt --into {folder}"
+    return f"vlagents-ray env make requirements/{name}.txt --out {folder}"
 
 
 def with_process(environment: EnvironmentArgs) -> EnvironmentArgs:

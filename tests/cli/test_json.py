@@ -1,0 +1,74 @@
+"""`--json` of every command that has it: one document, and nothing else, on stdout."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+import typer.main
+from eval_fakes import LINE
+from in_process_evaluation import play
+from typer.testing import CliRunner
+
+from vlagents_ray.cli import doctor, listing, robot_check
+from vlagents_ray.cli.doctor import Check
+from vlagents_ray.cli.main import app
+from vlagents_ray.envs.tabletop import Tabletop
+from vlagents_ray.evaluate import EvalConfig
+from vlagents_ray.registry import POLICIES, WRAPPERS
+
+ARM = "import numpy as np\nfrom vlagents_ray import Obs\nclass Arm:\n    def observe(self): return Obs(gripper=1.0)\n"
+ARM += "    def apply(self, action): pass\n    def stop(self): pass\n"
+
+
+def offering(command: Any, name: str = "") -> Iterator[str]:
+    """The names of the commands that have the option."""
+    for one, below in getattr(command, "commands", {}).items():
+        yield from offering(below, f"{name} {one}".strip())
+    if any("--json" in param.opts for param in command.params):
+        yield name
+
+
+def test_what_a_script_reads_is_json(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: Any) -> None:
+    monkeypatch.setattr(doctor, "checks", lambda *_: [("Ray", Check("fail", "none", "install it"))])
+    monkeypatch.setattr(listing, "env_class", lambda _: Tabletop)  # others load simulators
+    policies = [{"name": name, "url": f"http://localhost:{port}"} for port, name in enumerate(("a", "b"), 1)]
+    out = tmp_path / "out"
+    suites = [{"envs": [LINE], "episodes": 2}]
+    play(EvalConfig(policies=policies, suites=suites, record="all", video="none", out=out))
+    assert CliRunner().invoke(app, ["bundle", str(out), "--out", str(tmp_path / "b.zip")]).exit_code == 0
+    words = {
+        "policies": [],
+        "envs": ["tabletop"],
+        "doctor": [],
+        "report": [str(out)],
+        "verify": [str(tmp_path / "b.zip"), "--replay", "0"],
+    }
+    assert {*offering(typer.main.get_command(app))} == words.keys()
+    said = {}
+    for name, beside in words.items():
+        done = CliRunner().invoke(app, [name, *beside, "--json"])
+        assert (name, done.exit_code, done.stderr) == (name, int(name == "doctor"), "")
+        said[name] = json.loads(done.stdout)
+    found = {one["name"]: one for one in said["policies"]}
+    assert found.keys() == {*POLICIES, *WRAPPERS}
+    assert (found["noop"]["kind"], found["noop"]["missing"]) == ("policy", None)
+    assert found["noop"]["details"][0] == "action_dim=7"
+    assert [one["name"] for one in said["envs"]] == ["tabletop"]
+    assert said["doctor"] == [{"check": "Ray", "status": "fail", "detail": "none", "cure": "install it"}]
+    (pair,) = said["report"]["comparisons"]
+    assert (pair["a"], pair["b"], pair["lines"][-1]["suite"]) == ("a", "b", "all")
+    assert sum(cell["episodes"] for cell in said["report"]["cells"]) == 4
+    assert not (out / "report.html").exists()
+    assert said["verify"]["holds"] is True
+    assert {"subject", "verdict", "detail"} == said["verify"]["findings"][0].keys()
+
+    (tmp_path / "bare_arm.py").write_text(ARM)
+    monkeypatch.syspath_prepend(str(tmp_path))
+    assert robot_check.main(["bare_arm:Arm", "--json", "--out", str(tmp_path / "arm.html")]) == 1
+    checked = json.loads(capsys.readouterr().out)
+    assert checked["ok"] is False
+    assert checked["findings"][0].keys() == {"check", "got", "want", "cure", "when"}
