@@ -26,6 +26,7 @@ pytestmark = [pytest.mark.browser, pytest.mark.slow]
 STATE = "document.getElementById('evaluation-state').textContent"
 CARDS = "document.querySelectorAll('#failures article').length"
 PLAYING = "[...document.querySelectorAll('#failures video')].filter((one) => one.videoWidth === 48).length"
+UNFOLD = "document.getElementById('failures').closest('details').open = true"
 SCROLL = "document.getElementById('failures').scrollIntoView()"
 POINTS = "document.querySelectorAll('#curve .dot').length"
 
@@ -91,7 +92,12 @@ def test_cells_fill_with_their_intervals_and_failures_come_with_video(page: Page
         show(page, url)
         until(page, f"{CARDS} >= 10", want=True)
         page.value(SCROLL)
+        assert page.value(f"{PLAYING} + document.querySelectorAll('#failures video[src]').length") == 0
+        page.value(UNFOLD)
+        page.value(SCROLL)
         until(page, f"{PLAYING} >= 1", want=True)  # those that can be seen
+        controls = "((video) => { const before = video.controls; video.click(); return [before, video.controls]; })"
+        assert page.value(f"{controls}(document.querySelector('#failures video'))") == [False, True]
         assert page.value(f"{PLAYING} < {CARDS} - 1")
         cell = "document.querySelector('#cells .cell').innerText"
         assert "5 of 5" in page.value(cell)
@@ -135,5 +141,6 @@ def test_videos_are_requested_with_the_key(page: Page, results: Path) -> None:
             "document.querySelector('#key button').click(); })()"
         )
         until(page, f"{CARDS} >= 10", want=True)
+        page.value(UNFOLD)
         page.value(SCROLL)
         until(page, f"{PLAYING} >= 1", want=True)
