@@ -28,6 +28,11 @@ CARDS = "document.querySelectorAll('#failures article').length"
 PLAYING = "[...document.querySelectorAll('#failures video')].filter((one) => one.videoWidth === 48).length"
 UNFOLD = "document.getElementById('failures').closest('details').open = true"
 SCROLL = "document.getElementById('failures').scrollIntoView()"
+# Videos in view that are still requested: a server that ends before it sent them leaves their files open.
+LOADING = (
+    "[...document.querySelectorAll('#failures video:not([src])')].map((one) => one.getBoundingClientRect())"
+    ".filter((box) => box.bottom > 0 && box.top < innerHeight).length"
+)
 POINTS = "document.querySelectorAll('#curve .dot').length"
 
 
@@ -96,6 +101,7 @@ def test_cells_fill_with_their_intervals_and_failures_come_with_video(page: Page
         page.value(UNFOLD)
         page.value(SCROLL)
         until(page, f"{PLAYING} >= 1", want=True)  # those that can be seen
+        until(page, LOADING, 0)
         controls = "((video) => { const before = video.controls; video.click(); return [before, video.controls]; })"
         assert page.value(f"{controls}(document.querySelector('#failures video'))") == [False, True]
         assert page.value(f"{PLAYING} < {CARDS} - 1")
@@ -144,3 +150,4 @@ def test_videos_are_requested_with_the_key(page: Page, results: Path) -> None:
         page.value(UNFOLD)
         page.value(SCROLL)
         until(page, f"{PLAYING} >= 1", want=True)
+        until(page, LOADING, 0)

@@ -142,10 +142,10 @@ function showFailures(said) {
 function failureCard(one) {
   const name = `${one.task}, episode ${one.episode}`;
   const title = element("h3", { id: `failure-${one.key}` }, name);
-  const about = [one.policy, `seed ${one.seed}`, `${one.steps} steps`, new Date(1000 * one.finished).toLocaleTimeString()];
+  const about = [FAILURE_NAMES[one.outcome] || one.outcome, one.policy, `seed ${one.seed}`, `${one.steps} steps`, new Date(1000 * one.finished).toLocaleTimeString()];
   const card = element("article", {},
     ...one.videos.map((number) => videoOf(number, name)),
-    element("div", { className: "title" }, title, element("span", { className: "badge" }, FAILURE_NAMES[one.outcome] || one.outcome)),
+    title,
     element("p", { className: "instruction" }, one.instruction ? `“${one.instruction}”` : ""),
     element("p", { className: "bad" }, one.error),
     element("p", { className: "note" }, about.join(", ")));
