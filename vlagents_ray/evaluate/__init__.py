@@ -1,8 +1,8 @@
 """Evaluation: episodes as keyed jobs, played in parallel by Ray actors, recorded exactly once.
 
-summary = evaluate(
-    EvalConfig(policies=[{"url": "http://localhost:8000"}], suites=[{"envs": ["tabletop"]}], out="runs/first")
-)
+    suites = [{"envs": ["tabletop"]}]
+    config = EvalConfig(policies=[{"url": "http://localhost:8000"}], suites=suites, out="runs/first")
+    summary = evaluate(config)
 
 Configurations and results are read without Ray; code that plays or prints is loaded on first use.
 """

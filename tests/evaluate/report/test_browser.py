@@ -28,7 +28,7 @@ def report(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFact
 
 
 @pytest.mark.parametrize("scheme", ["light", "dark"])
-@pytest.mark.parametrize("width", [360, 1400])
+@pytest.mark.parametrize("width", [360, 1400, 2560])
 def test_it_fits_without_errors_or_requests(page: Page, report: Path, width: int, scheme: str) -> None:
     page.said.clear()
     page.asked.clear()
@@ -37,6 +37,8 @@ def test_it_fits_without_errors_or_requests(page: Page, report: Path, width: int
     assert page.said == []
     assert [address for address in page.asked if not address.startswith("data:")] == [report.as_uri()]
     assert page.value("document.querySelectorAll('h2').length") == 10
+    wall = page.value("getComputedStyle(document.documentElement).fontSize") == "22px"
+    assert wall == (width > 2400)
     light = page.value("getComputedStyle(document.body).backgroundColor") == "rgb(255, 255, 255)"
     assert light == (scheme == "light")
 
@@ -52,6 +54,9 @@ def test_what_counts_is_in_sight_beside_its_policies_on_a_narrow_screen(page: Pa
         page.open(report, width=width, scheme="light")
         assert page.value(right)
         assert (page.value(names) > 1) is (width == 360)
+    page.open(report, width=768, scheme="light")
+    hidden = "((frame) => frame.scrollWidth - frame.clientWidth)(document.querySelector('#success ~ .scroll'))"
+    assert page.value(hidden) == 0
 
 
 def test_its_videos_play(page: Page, report: Path) -> None:

@@ -52,6 +52,7 @@ def test_a_scene_is_set_played_and_judged(page: Page, tmp_path: Path, width: int
                 page.value("document.getElementById('opacity').value = 20")
                 until(page, "[...document.querySelectorAll('figure img')][1].style.opacity", "0.2")
             require_tidy(page, width)
+            assert page.value("document.querySelector('[data-do=ready]').getBoundingClientRect().bottom <= innerHeight")
             page.value(CLICK.format("ready"))
             if number > 2:
                 until(page, PHASE, "Running")

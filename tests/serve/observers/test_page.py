@@ -19,6 +19,8 @@ from vlagents_ray import Obs, RemoteAgent
 from vlagents_ray.chunking.player import ChunkPlayer, PlayerSettings
 from vlagents_ray.client.commands import CommandInbox
 from vlagents_ray.contract import ActionSpec, Contract
+from vlagents_ray.errors import PolicyFailed
+from vlagents_ray.interface import Act, Agent
 from vlagents_ray.policies.noop import Noop
 from vlagents_ray.protocol.messages import RankName
 from vlagents_ray.robot.loop import LoopReport, run_loop
@@ -104,10 +106,45 @@ def test_a_card_says_what_its_session_does(page: Page, server: LiveServer) -> No
         text = page.value("document.querySelector('article').innerText")
         assert "push cube 0" in text
         assert "robot, websocket" in text
+        name = "document.querySelector('article .name')"
+        assert len(page.value(f"{name}.title")) == 32
+        assert page.value(f"{name}.title.startsWith({name}.textContent.split(',')[0])")
+        assert page.value(f"{name}.textContent.indexOf(',')") == 8
+        first = "[...document.querySelectorAll('main section')].find((one) => one.checkVisibility())"
+        assert page.value(f"{first}.contains(document.querySelector('article'))"), "what happens now comes first"
         assert "plan: 8 rows" in text
         assert page.value("document.querySelectorAll('#fleet tr').length") == 1
         until(page, "document.getElementById('percentiles').innerText.includes(' ms')", True)
     until(page, CARDS, 0)  # it ended
+
+
+class Failing(Agent):
+    def reset(self, obs: Obs, instruction: str | None, **kwargs: object) -> dict[str, object]:
+        return {}
+
+    def act(self, obs: Obs) -> Act:
+        raise RuntimeError("secret")
+
+
+def test_an_error_is_its_code_until_it_is_unfolded(page: Page) -> None:
+    error = "document.querySelector('article .bad')"
+    with live_server(Failing()) as server, RemoteAgent(server.url) as agent:
+        agent.reset(Obs(), "push cube 0")
+        show(page, server)
+        until(page, CARDS, 1)
+        with pytest.raises(PolicyFailed):
+            agent.act(Obs())
+        until(page, f"{error}.innerText", "policy_failed")
+        page.value(f"{error}.open = true")
+        assert "request id" in page.value(f"{error}.innerText")
+
+
+def test_the_buttons_of_a_robot_are_in_one_row_on_a_phone(page: Page, server: LiveServer) -> None:
+    tops = "new Set([...document.querySelectorAll('article .row:first-child button')].map((one) => one.offsetTop)).size"
+    with operated(server):
+        show(page, server, width=360)
+        until(page, CARDS, 1)
+        until(page, tops, 1)
 
 
 PRESS = "(text) => [...document.querySelectorAll('article button')].find((one) => one.textContent === text).click()"

@@ -49,7 +49,7 @@ function show(found) {
     const box = document.createElement("input");
     box.type = "checkbox";
     box.value = part;
-    label.append(box, ` ${part} (${points})`);
+    label.append(box, ` ${part} (${points} ${points === 1 ? "point" : "points"})`);
     return label;
   });
   $("rubric").hidden = parts.length === 0;

@@ -62,8 +62,8 @@ function showCells(said) {
   const older = said.contenders.length - shown.length;
   byId("older").textContent = older ? `${older} earlier ones are in the learning curve alone.` : "";
   byId("interval").textContent = said.cells.some((cell) => cell.sequence)
-    ? "Upper bar: success, with a confidence sequence where a cell may stop early, else Wilson's interval of 95 %. Lower bar: episodes done."
-    : "Upper bar: success, with Wilson's interval of 95 %. Lower bar: episodes done.";
+    ? "Upper bar: success, with a confidence sequence where a cell may stop early, else Wilson's interval of 95\u00a0%. Lower bar: episodes done."
+    : "Upper bar: success, with Wilson's interval of 95\u00a0%. Lower bar: episodes done.";
   const cells = new Map(said.cells.map((cell) => [`${cell.task}\n${cell.policy}`, cell]));
   byId("cell-policies").replaceChildren(element("th", { scope: "col" }, "Task"), ...shown.map((name) => element("th", { scope: "col" }, name)));
   byId("cells").replaceChildren(...said.tasks.map((task) =>
@@ -127,8 +127,7 @@ function showCurves(curves) {
 // ---- failures
 
 function showFailures(said) {
-  byId("failure-count").textContent = said.failed ? `(${said.failed})` : "";
-  byId("no-failure").hidden = said.failed > 0;
+  byId("failure-count").textContent = said.failed;
   const left = said.failed - said.failures.length;
   byId("more-failures").textContent = left ? `${left} earlier ones are in the report.` : "";
   const present = new Set(said.failures.map((one) => one.key));
@@ -143,10 +142,10 @@ function showFailures(said) {
 function failureCard(one) {
   const name = `${one.task}, episode ${one.episode}`;
   const title = element("h3", { id: `failure-${one.key}` }, name);
-  const about = [one.policy, `seed ${one.seed}`, `${one.steps} steps`, new Date(1000 * one.finished).toLocaleTimeString()];
+  const about = [FAILURE_NAMES[one.outcome] || one.outcome, one.policy, `seed ${one.seed}`, `${one.steps} steps`, new Date(1000 * one.finished).toLocaleTimeString()];
   const card = element("article", {},
     ...one.videos.map((number) => videoOf(number, name)),
-    element("div", { className: "title" }, title, element("span", { className: "badge" }, FAILURE_NAMES[one.outcome] || one.outcome)),
+    title,
     element("p", { className: "instruction" }, one.instruction ? `“${one.instruction}”` : ""),
     element("p", { className: "bad" }, one.error),
     element("p", { className: "note" }, about.join(", ")));
@@ -161,7 +160,8 @@ const inView = new IntersectionObserver((entries) => {
 
 function videoOf(number, name) {
   const calm = matchMedia("(prefers-reduced-motion: reduce)").matches;
-  const video = element("video", { controls: true, muted: true, loop: true, playsInline: true, autoplay: !calm, ariaLabel: `Video: ${name}` });
+  const video = element("video", { controls: calm, muted: true, loop: true, playsInline: true, autoplay: !calm, tabIndex: 0, ariaLabel: `Video: ${name}` });
+  video.onclick = video.onfocus = () => { video.controls = true; }; // they would cover most of a small picture
   video.dataset.number = number;
   inView.observe(video);
   return video;

@@ -229,18 +229,17 @@ class Card {
     this.series = new Map(); // by part of the state: its last rows
     this.plots = new Map(); // by name
     this.images = new Map(); // by camera
-    this.badge = element("span", { className: "badge" });
     this.instruction = element("h3", {}, "No instruction");
-    this.error = element("p", { className: "bad" });
+    this.error = element("details", { className: "bad", hidden: true }, element("summary"), element("p"));
     this.cameras = element("div", { className: "cameras" });
     this.drawn = element("div", { className: "plots" });
     this.told = element("dl");
     const unique = `${cards.size}-${Date.now()}`;
-    const name = element("p", { id: `name-${unique}`, className: "name" }, id);
+    this.name = element("p", { id: `name-${unique}`, className: "name", title: id }, id.replace(/([0-9a-f]{8})[0-9a-f]{24}$/, "$1")); // 32 of them are drawn at random
     this.outcome = element("p", { className: "note", role: "status" });
     this.operated = this.buttons();
     this.numbers = element("details", {}, element("summary", {}, "Numbers"), this.drawn, this.told);
-    this.root = element("article", {}, element("div", { className: "title" }, this.instruction, this.badge), name, this.error, this.cameras, this.operated, this.numbers);
+    this.root = element("article", {}, this.instruction, this.name, this.error, this.cameras, this.operated, this.numbers);
     this.instruction.id = `session-${unique}`;
     this.root.setAttribute("aria-labelledby", `session-${unique} name-${unique}`);
     this.filter();
@@ -251,7 +250,7 @@ class Card {
     this.missed = 0;
     if (said.rank && said.rank !== this.rank) {
       this.rank = said.rank;
-      this.badge.textContent = `${said.rank === "robot" ? "robot" : "simulation"}, ${said.transport}`;
+      this.name.replaceChildren(this.name.firstChild, `, ${said.rank}, ${said.transport}`);
       this.numbers.open = said.rank === "robot";
       byId(said.rank === "robot" ? "sessions" : "simulations").append(this.root);
     }
@@ -276,7 +275,9 @@ class Card {
 
   act(act) {
     this.root.classList.toggle("failed", Boolean(act.error));
-    this.error.textContent = act.error ? `${act.error}: ${act.detail}` : "";
+    this.error.hidden = !act.error;
+    this.error.firstChild.textContent = act.error || "";
+    this.error.lastChild.textContent = act.detail || "";
     if (act.action) this.plot(act.rows > 1 ? `plan: ${act.rows} rows` : "action", this.planned(act));
     const ms = act.ms;
     if (ms.inference_ms !== undefined) {
@@ -361,7 +362,7 @@ class Card {
       lines.push(polyline(points.filter(Boolean), COLOURS[joint % COLOURS.length]));
     }
     svg.replaceChildren(...lines);
-    const told = `${name}, ${range ? `${number(low)} to ${number(high)}` : number(low)}`;
+    const told = `${name}\n${range ? `${number(low)} to ${number(high)}` : number(low)}`;
     svg.previousSibling.textContent = told;
     svg.setAttribute("aria-label", told);
   }
