@@ -8,8 +8,8 @@ import time
 from typing import Any
 
 from benchmarks.own_clients import observation
-from vlagents_ray.bench.line_client import die_with_parent, own_stdout
 from vlagents_ray.registry import policy_class
+from vlagents_ray.serve.python_env.child_start import die_with_parent, own_stdout
 
 
 class BarePolicy:

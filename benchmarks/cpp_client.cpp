@@ -1,5 +1,5 @@
 // The C++ client of a benchmark: cpp_client URL FOLDER
-// It obeys the line protocol of vlagents_ray/bench/line_client.py: a number of calls in, the milliseconds of each out.
+// It obeys the line protocol of benchmarks/line_client.py: a number of calls in, the milliseconds of each out.
 #include <chrono>
 #include <cstddef>
 #include <fstream>

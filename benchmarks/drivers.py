@@ -28,7 +28,7 @@ class ProcessDriver(Driver, Protocol):
 
 
 class ClientProcess(LineProcess):
-    """A client in a process, which runs `vlagents_ray.bench.line_client.obey`."""
+    """A client in a process, which runs `benchmarks.line_client.obey`."""
 
     server_pid: int | None = None
 

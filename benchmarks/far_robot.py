@@ -16,7 +16,6 @@ from typing import Any, ClassVar
 import numpy as np
 from pydantic import BaseModel, Field
 
-from vlagents_ray.bench.line_client import die_with_parent, own_stdout
 from vlagents_ray.chunking.player import ChunkPlayer, PlayerSettings
 from vlagents_ray.client.agent import RemoteAgent
 from vlagents_ray.contract import ActionSpec, CameraSpec, Contract, StateSpec
@@ -24,6 +23,7 @@ from vlagents_ray.interface import DELAY, LEFTOVER, SAFE, Act, Agent, Obs
 from vlagents_ray.robot.loop import run_loop
 from vlagents_ray.robot.safety import Guard, Watchdog
 from vlagents_ray.robot.simulated import SimulatedRobot
+from vlagents_ray.serve.python_env.child_start import die_with_parent, own_stdout
 
 HZ = 30.0
 CHUNK = 50  # rows: 1.7 s

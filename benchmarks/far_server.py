@@ -15,7 +15,6 @@ from dataclasses import asdict
 import uvicorn
 
 from benchmarks.far_robot import FarPolicy
-from vlagents_ray.bench.line_client import die_with_parent, own_stdout
 from vlagents_ray.protocol.messages import DEFAULT_LIMITS, PROTOCOL_VERSION
 from vlagents_ray.serve.access.api_keys import NoKey
 from vlagents_ray.serve.endpoints.access_middleware import AccessMiddleware
@@ -23,6 +22,7 @@ from vlagents_ray.serve.endpoints.http import build_http_app
 from vlagents_ray.serve.endpoints.websocket import WebSocketServer
 from vlagents_ray.serve.engine.engine import Engine
 from vlagents_ray.serve.ports import EVERYWHERE
+from vlagents_ray.serve.python_env.child_start import die_with_parent, own_stdout
 
 
 def main() -> None:

@@ -1,5 +1,5 @@
 // The TypeScript client of a benchmark: node node_client.mjs CLIENT URL TRANSPORT FOLDER
-// It obeys the line protocol of vlagents_ray/bench/line_client.py: a number of calls in, the milliseconds of each out.
+// It obeys the line protocol of benchmarks/line_client.py: a number of calls in, the milliseconds of each out.
 
 import { readFileSync } from "node:fs";
 import { createInterface } from "node:readline";

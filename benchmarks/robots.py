@@ -20,9 +20,9 @@ from functools import partial
 from typing import Any, NamedTuple
 
 from benchmarks.own_clients import connect, observation
-from vlagents_ray.bench.line_client import die_with_parent, own_stdout
 from vlagents_ray.client.agent import RemoteAgent
 from vlagents_ray.errors import VLAgentsError
+from vlagents_ray.serve.python_env.child_start import die_with_parent, own_stdout
 
 _CONNECT_S = 120.0
 

@@ -21,13 +21,13 @@ from typing import Any, NamedTuple
 from benchmarks.environments import ACTION_DIM, SLEEPING_ENV
 from benchmarks.overhead import recorded, steady
 from benchmarks.processes import cpu_seconds, program
-from vlagents_ray.bench.line_client import die_with_parent, own_stdout
 from vlagents_ray.evaluate import EvalConfig, PolicyConfig, Progress, Results, SuiteConfig, WorkerConfig, evaluate
 from vlagents_ray.evaluate.episode.records import EpisodeResult
 from vlagents_ray.evaluate.plan.cases import EvalCase
 from vlagents_ray.policies.noop import Noop, NoopConfig
 from vlagents_ray.serve.launch.deployment_file import deployment, together
 from vlagents_ray.serve.launch.server import running_server
+from vlagents_ray.serve.python_env.child_start import die_with_parent, own_stdout
 
 NEAR = ("shm", "plasma", "local")  # transports within a node
 DAEMONS = ("gcs_server", "raylet", "ServeController")  # of this node

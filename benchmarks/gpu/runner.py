@@ -22,9 +22,9 @@ from benchmarks.checkpoints import pi0
 from benchmarks.figures import measured_on
 from benchmarks.gpu.lab import Lab, Plan
 from benchmarks.gpu.steps import Step
-from vlagents_ray.bench.line_client import die_with_parent
 from vlagents_ray.policies.compilation import Compilation
 from vlagents_ray.registry import require
+from vlagents_ray.serve.python_env.child_start import die_with_parent
 
 _SPARE_S = 15.0  # without which no step is started
 _STACKS_S = (

@@ -24,7 +24,8 @@ import numpy as np
 
 if TYPE_CHECKING:
     from benchmarks.closed_loop import ClosedLoop
-    from vlagents_ray.bench.line_client import die_with_parent, obey, own_stdout, timed
+    from benchmarks.line_client import obey, timed
+    from vlagents_ray.serve.python_env.child_start import die_with_parent, own_stdout
 else:  # the peers' Python has no vlagents_ray: files are loaded by their paths
 
     def _load(path: str) -> ModuleType:
@@ -34,8 +35,8 @@ else:  # the peers' Python has no vlagents_ray: files are loaded by their paths
         spec.loader.exec_module(module)
         return module
 
-    _LINES = _load("vlagents_ray/bench/line_client.py")
-    die_with_parent, obey, own_stdout, timed = _LINES.die_with_parent, _LINES.obey, _LINES.own_stdout, _LINES.timed
+    _LINES, _START = _load("benchmarks/line_client.py"), _load("vlagents_ray/serve/python_env/child_start.py")
+    die_with_parent, obey, own_stdout, timed = _START.die_with_parent, _LINES.obey, _START.own_stdout, _LINES.timed
     ClosedLoop = _load("benchmarks/closed_loop.py").ClosedLoop
 
 __all__ = ["Client", "Policy", "Target", "die_with_parent", "run", "wait_for_port"]

@@ -8,13 +8,13 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+import minimal_client
 import numpy as np
 import pytest
 from asgi_server import policy_server
+from minimal_client import Policy, PolicyError
 
 from vlagents_ray import Act, Agent, Obs
-from vlagents_ray.client import minimal
-from vlagents_ray.client.minimal import Policy, PolicyError
 
 SLOW_S = 1.5
 IMAGE = np.random.default_rng(0).integers(0, 256, (48, 64, 3), np.uint8)
@@ -48,7 +48,7 @@ def joints(first: float) -> dict[str, np.ndarray]:
 
 
 def test_it_stands_alone_and_on_one_screen() -> None:
-    text = Path(minimal.__file__).read_text()
+    text = Path(minimal_client.__file__).read_text()
     assert len(text.splitlines()) <= 80
     nodes = [node for node in ast.walk(ast.parse(text)) if isinstance(node, ast.Import | ast.ImportFrom)]
     names = {alias.name for node in nodes for alias in node.names if isinstance(node, ast.Import)}

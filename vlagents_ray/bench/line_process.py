@@ -1,4 +1,4 @@
-"""Processes of a benchmark: each implements the line protocol of `line_client`, and never outlives this process."""
+"""Processes of a benchmark: each implements a line protocol, and never outlives this process."""
 
 from __future__ import annotations
 

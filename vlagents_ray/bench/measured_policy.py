@@ -21,7 +21,6 @@ from typing import Any
 import numpy as np
 from typing_extensions import Self
 
-from vlagents_ray.bench.line_client import die_with_parent, own_stdout
 from vlagents_ray.contract import Contract
 from vlagents_ray.errors import PolicyFailed
 from vlagents_ray.interface import Act, Agent, Obs
@@ -29,6 +28,7 @@ from vlagents_ray.policies.wrapper import Wrapper, build_agent
 from vlagents_ray.protocol.messages import RankName, Reply, Request
 from vlagents_ray.serve.engine.engine import Engine
 from vlagents_ray.serve.models.agent_copies import AgentCopies
+from vlagents_ray.serve.python_env.child_start import die_with_parent, own_stdout
 from vlagents_ray.serve.requests import RANKS, PendingRequest
 from vlagents_ray.testing import random_observation
 from vlagents_ray.validation import check_observation

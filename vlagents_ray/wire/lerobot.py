@@ -251,10 +251,6 @@ def write_data(data: bytes) -> bytes:
     return bytes([1 << 3 | _BYTES, *size, length]) + data
 
 
-def method(name: str) -> str:
-    return f"/{SERVICE}/{name}"
-
-
 EMPTY = b""  # an `Empty`, and an `Actions` without a pickle
 
 

@@ -12,11 +12,9 @@ once.
 
 from __future__ import annotations
 
-import ctypes
 import json
 import logging
 import os
-import signal
 import sys
 import threading
 from collections.abc import Callable, Sequence
@@ -32,13 +30,13 @@ from vlagents_ray.protocol.messages import INNER_OPS, Limits
 from vlagents_ray.serve.access.api_keys import NoKey
 from vlagents_ray.serve.endpoints.shm import ShmServer
 from vlagents_ray.serve.engine.engine import Engine
+from vlagents_ray.serve.python_env.child_start import die_with_parent, own_stdout
 from vlagents_ray.serve.queue.call_limits import CallLimits
 from vlagents_ray.serve.weights import PushOptions, WeightUpdates
 from vlagents_ray.weights.safetensors import read_values, write_values
 from vlagents_ray.weights.shared_values import NotShared, SharedValues
 from vlagents_ray.weights.trainable import dtype_name
 
-_PR_SET_PDEATHSIG = 1
 # The replica checks requests, removes idle sessions and detects calls that take too long, so the child does not.
 _NO_LIMITS = Limits(**dict.fromkeys([limit.name for limit in fields(Limits)], 2**40))
 _NEVER_S = 1e6
@@ -74,10 +72,8 @@ def examine(policy: str, config: dict[str, Any], wrappers: Sequence[Any] = ()) -
 
 def run() -> None:
     """Run the policy until the replica closes it or ends."""
-    if sys.platform == "linux":
-        ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
-    answers = os.fdopen(os.dup(1), "w")
-    os.dup2(2, 1)  # redirects printed text to the replica's log
+    die_with_parent()
+    answers = own_stdout()  # printed text goes to the replica's log
     logging.basicConfig(level=logging.INFO, format="%(levelname)s %(name)s: %(message)s")
     settings = Settings(**json.loads(_line()))
     over = threading.Event()

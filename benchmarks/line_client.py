@@ -1,37 +1,19 @@
-"""The client's side of a benchmark's line protocol, for processes that `line_process` starts.
+"""The client's side of a benchmark's line protocol, for processes that `vlagents_ray.bench.line_process` starts.
 
 A client writes one line of JSON when it is connected and warm. Then each line of its input is a number of calls to
-make, which it answers with a JSON list of their milliseconds. It ends with its standard input or with its parent. It
-needs only the standard library: the scripts of other policy servers (`benchmarks/peers`) load this file with a Python
+make, which it answers with a JSON list of their milliseconds. It ends with its standard input or with its parent. This
+file needs only the standard library, as the scripts of other policy servers (`benchmarks/peers`) load it with a Python
 without vlagents_ray.
 """
 
 from __future__ import annotations
 
-import ctypes
 import json
-import os
-import signal
-import sys
 import time
 from collections.abc import Callable, Iterable
 from typing import Any, TextIO
 
 WARM_UP = 20  # calls
-_PR_SET_PDEATHSIG = 1
-
-
-def die_with_parent() -> None:
-    """Make the kernel kill this process when its parent ends, however that happens. Linux only."""
-    if sys.platform == "linux":
-        ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
-
-
-def own_stdout() -> TextIO:
-    """Reserve the standard output for the protocol, and return it; all other output goes to standard error."""
-    out = os.fdopen(os.dup(1), "w")
-    os.dup2(2, 1)
-    return out
 
 
 def timed(prepare: Callable[[], Any], call: Callable[[Any], object], calls: int) -> list[float]:

@@ -1,4 +1,4 @@
-"""A client on one screen, to copy into a robot's program: it needs numpy, simplejpeg and websockets.
+"""A client on one screen; copy minimal_client.py into a robot's program, which needs numpy, simplejpeg and websockets.
 
     with Policy("ws://gpu-box:8000/v1/stream") as policy:
         policy.reset({"front": image}, {"joints": joints}, instruction="stack the cups")
