@@ -18,6 +18,7 @@ from vlagents_ray.interface import Act
 from vlagents_ray.learn import Publisher
 from vlagents_ray.protocol.messages import Request
 from vlagents_ray.serve.engine.engine import Engine
+from vlagents_ray.serve.weights import PushOptions
 from vlagents_ray.weights import trainable
 from vlagents_ray.weights.trainable import fingerprint
 
@@ -117,6 +118,18 @@ def test_a_pushed_adapter_acts_as_the_saved_one_and_all_else_as_before(
     assert {name: action for name, (action, _) in played(engine).items()} == {
         name: one for name, (one, _) in before.items()
     }
+
+
+def test_a_replica_that_starts_later_states_and_does_the_same(
+    tmp_path: Path, values: dict[str, dict[str, np.ndarray]], serving: Callable[[Agent], Engine]
+) -> None:
+    engines = [serving(Small.from_config(settings(tmp_path, stack="stack", pour="pour"))) for _ in range(2)]
+    Publisher(engines[0]).push(pushed(values["stack"]), partial=True, allow_same=True)  # as a training begins
+    [held] = [one for one in engines[0].weights.held() if one.number]
+    engines[1].weights.stage(held.number, held.values, PushOptions(allow_same=True))
+    engines[1].weights.commit(held.number, PushOptions())
+    assert played(engines[0]) == played(engines[1])
+    assert played(engines[0])["pour"][1]["version"] == 1
 
 
 def test_sessions_of_two_versions_keep_theirs_until_their_reset(
