@@ -223,3 +223,4 @@ def test_a_row_with_an_adapter_acts_as_the_adapter_merged(folder: Path, tmp_path
     acts = [act.action for act in adapted.act_batch(views, sessions)]
     np.testing.assert_allclose(acts[0], acted(merged, views)[0], atol=BATCHED)
     np.testing.assert_allclose(acts[1], acted(loaded, views)[1], atol=BATCHED)
+    check_pushed_weights(adapted, lambda: begun(adapted, 0, adapter="own").act(seen(0)).action, "own/")

@@ -99,12 +99,10 @@ def gains(gain: float) -> dict[str, Any]:
 
 
 def in_child(policy: str = "Gain", **config: Any) -> Any:
-    """The proxy of one of these policies in a child process."""
+    """The proxy of one of these policies, or of "module:Class", in a child process."""
     from vlagents_ray.serve.python_env.child_agent import Child, ChildAgent
     from vlagents_ray.serve.python_env.child_main import Settings
 
-    here = Path(__file__).parent
+    here, policy = Path(__file__).parent, policy if ":" in policy else f"gain_policies:{policy}"
     paths = os.pathsep.join([str(here), str(here.parents[1])])
-    return ChildAgent(
-        Child(sys.executable, Settings(f"gain_policies:{policy}", config, 16, "1"), {"PYTHONPATH": paths})
-    )
+    return ChildAgent(Child(sys.executable, Settings(policy, config, 16, "1"), {"PYTHONPATH": paths}))

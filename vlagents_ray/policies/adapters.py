@@ -20,20 +20,13 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from vlagents_ray.errors import (
-    ConfigError,
-    MalformedMessage,
-    NotTrainable,
-    PolicyFailed,
-    UnknownCheckpoint,
-    UnknownSession,
-)
+from vlagents_ray.errors import ConfigError, MalformedMessage, PolicyFailed, UnknownCheckpoint, UnknownSession
 from vlagents_ray.interface import POLICY
 from vlagents_ray.weights.safetensors import PART_BYTES, ValuesReader, read_header
 from vlagents_ray.weights.trainable import converted
 
 ADAPTER = "adapter"  # option of a reset: the name of the session's adapter
-_DIGITS = 16  # hexadecimal digits of a fingerprint
+DIGITS = 16  # hexadecimal digits of the fingerprint of a checkpoint
 
 
 @dataclass(frozen=True, slots=True)
@@ -49,7 +42,7 @@ class Adapter:
     def of(cls, source: str, base: str, own: str, revision: str | None = None) -> Adapter:
         """Make an adapter from its source and commit, and from the digests of the base and of its own files."""
         digest = hashlib.sha256(f"{base} {own}".encode()).hexdigest()
-        return cls(source, f"{own.partition(':')[0]}:{digest}", digest[:_DIGITS], revision)
+        return cls(source, f"{own.partition(':')[0]}:{digest}", digest[:DIGITS], revision)
 
     @property
     def identity(self) -> dict[str, Any]:
@@ -63,17 +56,48 @@ class Adapter:
 _CHOSEN: ContextVar[Any] = ContextVar("chosen adapters", default=None)
 
 
+class _Values(dict[str, Any]):
+    """The values of one adapter by their names in its file, float32 in the memory of the host.
+
+    A value that is set is also rounded into the tensors that the passes read.
+    """
+
+    def __init__(self, place: int) -> None:
+        self.place = place  # its index in the tensors of all adapters
+        self.pushed: set[str] = set()  # names whose values a learner has pushed
+        self._targets: dict[str, tuple[Any, Any, float]] = {}
+
+    def read(self, name: str, value: Any, target: Any, scale: float) -> None:
+        """Set a value of the file, which is written into `target` after multiplication by `scale`."""
+        self._targets[name] = value, target, scale
+        self[name] = value
+
+    def __setitem__(self, name: str, value: Any) -> None:
+        if value is not self.get(name):
+            read, target, scale = self._targets[name]
+            target.copy_(value.reshape(target.shape) * scale)
+            (self.pushed.discard if value is read else self.pushed.add)(name)
+            super().__setitem__(name, value)
+
+
 class Adapters:
     """The adapters of one network."""
 
     def __init__(self) -> None:
+        self.base = ""  # fingerprint of the base alone
+        self.moved: list[tuple[Any, Any]] = []  # memory of the base that is on the host while the policy sleeps
         self._named: dict[str, Adapter] = {}
-        self._places: dict[str, int] = {"": 0}  # by fingerprint: the index in the tensors of all adapters
+        self._values = {"": _Values(0)}  # by fingerprint; those of the base are zeros
         self._device: Any = None
 
     @property
     def ids(self) -> dict[str, str]:
         return {name: adapter.weights for name, adapter in self._named.items()}
+
+    @property
+    def trainable(self) -> dict[str, dict[str, Any]]:
+        """The values of each adapter by their names in its file, which act when they are replaced."""
+        return {name: self._values[adapter.fingerprint] for name, adapter in self._named.items()}
 
     def load(
         self,
@@ -95,25 +119,27 @@ class Adapters:
         """
         import torch
 
-        layers: dict[str, dict[int, tuple[Any, Any]]] = {}  # A and B by layer and index
+        layers: dict[str, dict[str, tuple[Any, Any, float]]] = {}  # A, B and scale by layer and fingerprint
         for name, source in sources.items():
             try:
                 adapter, folder = find(source)
-                place = self._places.setdefault(adapter.fingerprint, len(self._places))
-                for layer, pair in read_adapter(folder, network).items():
-                    layers.setdefault(layer, {})[place] = pair
+                self._values.setdefault(adapter.fingerprint, _Values(len(self._values)))
+                for layer, read in read_adapter(folder, network).items():
+                    layers.setdefault(layer, {})[adapter.fingerprint] = read
                 adapt(adapter.fingerprint, folder)
             except ConfigError as error:
                 raise ConfigError(f"adapter {name!r}: {error}") from error
             self._named[name] = adapter
         modules = dict(network.named_modules())
-        for layer, pairs in layers.items():
+        for layer, found in layers.items():
             weight = modules[layer].weight
-            (outputs, *inputs), rank = weight.shape, max(len(down) for down, _ in pairs.values())
-            downs = torch.zeros(len(self._places), rank, *inputs, dtype=weight.dtype, device=weight.device)
-            ups = torch.zeros(len(self._places), outputs, rank, dtype=weight.dtype, device=weight.device)
-            for place, (down, up) in pairs.items():
-                downs[place, : len(down)], ups[place, :, : len(down)] = down, up
+            (outputs, *inputs), rank = weight.shape, max(len(down) for down, _, _ in found.values())
+            downs = torch.zeros(len(self._values), rank, *inputs, dtype=weight.dtype, device=weight.device)
+            ups = torch.zeros(len(self._values), outputs, rank, dtype=weight.dtype, device=weight.device)
+            for fingerprint, (down, up, scale) in found.items():
+                values = self._values[fingerprint]
+                values.read(f"{_PREFIX}{layer}{_DOWN}", down, downs[values.place, : len(down)], 1.0)
+                values.read(f"{_PREFIX}{layer}{_UP}", up, ups[values.place, :, : len(down)], scale)
             modules[layer].register_forward_hook(partial(self._add, downs, ups))
             self._device = weight.device
 
@@ -129,22 +155,28 @@ class Adapters:
 
     def example(self, number: int) -> str:
         """Return an adapter's fingerprint for example row `number`; successive rows have different ones."""
-        return list(self._places)[(number + 1) % len(self._places)]
+        return list(self._values)[(number + 1) % len(self._values)]
 
     def require(self, fingerprint: str) -> str:
         """Return the fingerprint; raise `UnknownSession` if the adapter of a moved session is not loaded here."""
-        if fingerprint not in self._places:
+        if fingerprint not in self._values:
             raise UnknownSession(f"its adapter {fingerprint} is not loaded here; reset the session")
         return fingerprint
 
     def stated(self, fingerprint: str) -> dict[str, Any]:
-        """Return the info of an act about the weights that computed it; empty if they are the base's alone."""
-        return {POLICY: {"version": 0, "fingerprint": fingerprint}} if fingerprint else {}
+        """Return the info of an act about its weights, which no push has changed; empty if the server states them.
+
+        A version of a learner is one of all adapters, which a replica that starts later gets as a whole.
+        """
+        if fingerprint and any(values.pushed for values in self._values.values()):
+            return {}
+        stated = fingerprint or self.base
+        return {POLICY: {"version": 0, "fingerprint": stated}} if stated else {}
 
     @contextmanager
     def rows(self, fingerprints: Iterable[str]) -> Iterator[None]:
         """Apply an adapter to each row of the network's passes on this thread."""
-        places, chosen = [self._places[one] for one in fingerprints], None
+        places, chosen = [self._values[one].place for one in fingerprints], None
         if any(places):
             import torch
 
@@ -182,15 +214,6 @@ def _convolved(module: Any, x: Any, downs: Any, ups: Any, chosen: Any) -> Any:
     return ups[chosen] @ seen.view(len(x), downs.shape[1], -1)
 
 
-def require_base_alone(adapters: Mapping[str, str]) -> None:
-    """Raise `NotTrainable` if adapters were trained on the base, which a learner would replace."""
-    if adapters:
-        raise NotTrainable(
-            f"adapters {sorted(adapters)}: they belong to the weights of their checkpoint, which a learner's would "
-            f"replace; train on a deployment without adapters"
-        )
-
-
 CONFIG, WEIGHTS = "adapter_config.json", "adapter_model.safetensors"
 FILES = (CONFIG, WEIGHTS)
 _PREFIX = "base_model.model."  # of all names in the file
@@ -218,7 +241,7 @@ def base_of(folder: Path) -> str | None:
     return named
 
 
-def read_adapter(folder: Path, network: Any) -> dict[str, tuple[Any, Any]]:
+def read_adapter(folder: Path, network: Any) -> dict[str, tuple[Any, Any, float]]:
     """Read an adapter and check that it fits a network.
 
     Args:
@@ -227,7 +250,7 @@ def read_adapter(folder: Path, network: Any) -> dict[str, tuple[Any, Any]]:
 
     Returns:
         For each layer that the adapter changes, by the name of its module: A (r, in), or (r, in, height, width) of a
-        convolution, and scale * B (out, r), in the type and on the device of the layer's weights.
+        convolution, B (out, r), or (out, r, 1, 1), both float32 in the memory of the host, and the scale of B.
 
     Raises:
         ConfigError: The adapter is not a LoRA of linear layers and convolutions, is damaged, or does not fit the
@@ -323,8 +346,8 @@ def _require_adaptable(folder: Path, names: list[str], modules: Mapping[str, Any
 
 def _layer(
     folder: Path, name: str, saved: Mapping[str, Any], config: Mapping[str, Any], weight: Any
-) -> tuple[Any, Any]:
-    from torch import float32, isfinite
+) -> tuple[Any, Any, float]:
+    from torch import empty, float32
 
     raw = [saved[f"{_PREFIX}{name}{end}"] for end in (_DOWN, _UP)]
     if not all(one.dtype.kind in "fV" for one in raw):  # V: bfloat16, which numpy lacks
@@ -333,7 +356,7 @@ def _layer(
             f"adapter without quantization"
         )
     # scaled before rounding to the type of the weights
-    down, up = (converted(one, weight.new_empty(0, dtype=float32)) for one in raw)
+    down, up = (converted(one, empty(0, dtype=float32)) for one in raw)
     (outputs, *inputs), rank = weight.shape, down.shape[0] if down.ndim else 0
     wanted = (rank, *inputs), (outputs, rank, *(1 for _ in inputs[1:]))
     if (tuple(down.shape), tuple(up.shape)) != wanted or not rank:
@@ -344,11 +367,10 @@ def _layer(
     alpha = config.get("lora_alpha")
     if isinstance(alpha, bool) or not isinstance(alpha, int | float) or not math.isfinite(alpha):
         raise ConfigError(f"{folder / CONFIG}: got lora_alpha {alpha!r}, want a number")
-    scaled = up.flatten(1) * (alpha / (math.sqrt(rank) if config.get("use_rslora") else rank))
-    down, scaled = down.to(weight.dtype), scaled.to(weight.dtype)
-    if not (isfinite(down).all() and isfinite(scaled).all()):
+    scale = alpha / (math.sqrt(rank) if config.get("use_rslora") else rank)
+    if not all(one.to(weight.dtype).isfinite().all() for one in (down, up * scale)):
         raise ConfigError(
             f"{folder / WEIGHTS}: {name}: got NaN or infinite values as {weight.dtype}, want finite ones; take an "
             f"earlier step of the training"
         )
-    return down, scaled
+    return down, up, scale

@@ -43,7 +43,6 @@ from vlagents_ray.weights.trainable import beside_acts
 
 logger = logging.getLogger(__name__)
 
-DIGITS = 16  # length of a checkpoint's digest that replaces a fingerprint, hexadecimal digits
 STAGED_S = 60.0  # time for which a staged version waits for its commit, s
 
 PushMode = Literal["keep", "next_episode"]

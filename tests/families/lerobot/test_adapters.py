@@ -14,6 +14,7 @@ import pytest
 import torch
 from adapted_network import merge, pairs, save
 from lerobot.policies.factory import make_pre_post_processors
+from pushed_weights import check_pushed_weights
 
 from tests.families.lerobot import tiny
 from tests.families.lerobot.conftest import FILTERS, TASKS, Load, Made, begun, view
@@ -126,6 +127,13 @@ def test_each_row_of_one_pass_acts_as_its_adapter_merged_alone(
         if name is not None:
             base = begun(alone(None), number).act(view(number, **infos(number)))
             assert np.abs(base.action - wanted.action).max() > 100 * ATOL
+
+
+def test_a_learner_pushes_one_of_them(adapted: LeRobot) -> None:
+    others = [session(adapted, 0, name).act(view(0)).action for name in (None, "units")]
+    check_pushed_weights(adapted, lambda: session(adapted, 0, "all").act(view(0)).action, "all/")
+    for name, action in zip((None, "units"), others, strict=True):
+        assert np.array_equal(session(adapted, 0, name).act(view(0)).action, action)
 
 
 def test_types_without_a_flow_take_no_adapters(made: Made, saved: dict[str, Path]) -> None:

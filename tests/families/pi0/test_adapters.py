@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 import torch
 from adapted_network import merge, pairs, save
+from pushed_weights import check_pushed_weights
 
 from tests.families.pi0.conftest import WORDS, made, seen
 from vlagents_ray.errors import ConfigError
@@ -67,6 +68,14 @@ def test_each_row_of_one_pass_acts_as_its_adapter_merged_alone(
                 samples = (one.info[DISTRIBUTION]["samples"] for one in (act, wanted))
                 np.testing.assert_allclose(*samples, atol=ATOL)
             assert chosen is None or np.abs(wanted.action - plain[seed]).max() > 100 * ATOL
+
+
+def test_a_learner_pushes_one_of_them(folder: Path, saved: dict[str, tuple[Path, dict[str, np.ndarray]]]) -> None:
+    policy = made(folder, adapters={name: str(path) for name, (path, _) in saved.items()})
+    others = [session(policy, 0, adapter=name).act(seen(0)).action for name in (None, "second")]
+    check_pushed_weights(policy, lambda: session(policy, 0, adapter="first").act(seen(0)).action, "first/")
+    for name, action in zip((None, "second"), others, strict=True):
+        assert np.array_equal(session(policy, 0, adapter=name).act(seen(0)).action, action)
 
 
 def test_an_adapter_with_other_statistics_is_refused(

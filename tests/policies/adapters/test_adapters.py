@@ -12,9 +12,9 @@ import pytest
 from adapted_network import DIM, LAYERS, Small, base, merge, pairs, save
 
 from vlagents_ray import Obs
-from vlagents_ray.errors import ConfigError, NotTrainable, UnknownCheckpoint, UnknownSession
+from vlagents_ray.errors import ConfigError, UnknownCheckpoint, UnknownSession
 from vlagents_ray.interface import DISTRIBUTION, POLICY, SAMPLES, Act
-from vlagents_ray.policies.adapters import read_adapter
+from vlagents_ray.policies.adapters import Adapter, Adapters, read_adapter
 from vlagents_ray.serve.models.agent_copies import AgentCopies
 
 pytestmark = pytest.mark.torch
@@ -122,9 +122,9 @@ def test_acts_and_resets_say_which_adapter_it_was(tmp_path: Path) -> None:
     three(tmp_path)
     policy = loaded(tmp_path, adapters=paths(tmp_path, "stack", "pour"))
     said = {name: begun(policy, 0, adapter=name).act(at(0)).info.get(POLICY) for name in (None, "stack", "pour")}
-    assert said[None] is None  # the server states the base's
-    assert said["stack"]["fingerprint"] != said["pour"]["fingerprint"]
     assert policy.weights_id is not None
+    assert said[None] == {"version": 0, "fingerprint": policy.weights_id["digest"].rpartition(":")[2][:16]}
+    assert said["stack"]["fingerprint"] != said["pour"]["fingerprint"]
     ids = policy.weights_id["adapters"]
     for name in ("stack", "pour"):
         info = begun(policy, 0).reset(at(0), None, adapter=name)
@@ -163,12 +163,6 @@ def test_an_adapter_that_is_not_offered_is_refused_with_what_is(tmp_path: Path) 
     policy = loaded(tmp_path, adapters=paths(tmp_path, "stack", "pour"))
     with pytest.raises(UnknownCheckpoint, match=r"got 'fold', want one of \['pour', 'stack'\], or none"):
         begun(policy, 0, adapter="fold")
-
-
-def test_a_learner_cannot_replace_the_base_of_adapters(tmp_path: Path) -> None:
-    three(tmp_path)
-    with pytest.raises(NotTrainable, match=r"adapters \['stack'\]: they belong to the weights"):
-        loaded(tmp_path, adapters=paths(tmp_path, "stack")).parameters()
 
 
 @pytest.mark.parametrize("setting", [{"compile": True}, {"quantization": "int8"}])
@@ -314,10 +308,14 @@ def test_a_damaged_config_is_refused(tmp_path: Path, content: str) -> None:
 def test_values_are_scaled_before_they_are_rounded(tmp_path: Path) -> None:
     small = network(tmp_path).half()
     values = pairs(small, LAYERS, 2)
-    folder = save(tmp_path / "tiny", {name: value * np.float32(1e-9) for name, value in values.items()}, lora_alpha=2e9)
-    _, scaled = read_adapter(folder, small)["see"]
-    wanted = values["base_model.model.see.lora_B.weight"]
-    np.testing.assert_allclose(scaled.float().numpy(), wanted, rtol=1e-3)
+    tiny = {name: value * np.float32(1e-9) if ".lora_B." in name else value for name, value in values.items()}
+    folder, x = save(tmp_path / "tiny", tiny, lora_alpha=2e9), small["see"].weight.new_tensor(np.eye(DIM))
+    adapters, plain = Adapters(), small["see"](x)
+    adapters.load(small, {"tiny": str(folder)}, lambda source: (Adapter.of(source, "", ""), folder), lambda *_: None)
+    with adapters.rows([adapters.named("tiny").fingerprint] * DIM):
+        change = small["see"](x) - plain
+    down, up = (values[f"base_model.model.see.lora_{part}.weight"] for part in "AB")
+    np.testing.assert_allclose(change.detach().numpy(), (up @ down).T, atol=4e-3)
     huge = save(tmp_path / "huge", values, lora_alpha=2e6)
     with pytest.raises(ConfigError, match=r"got NaN or infinite values as torch\.float16"):
         read_adapter(huge, small)

@@ -21,7 +21,7 @@ from vlagents_ray.chunking.buffer import ENSEMBLE, Chunk, ChunkBuffer
 from vlagents_ray.contract import Contract
 from vlagents_ray.errors import ConfigError, InvalidAction, InvalidObservation, NotReset, PolicyFailed
 from vlagents_ray.interface import BEHAVIOUR, DELAY, DISTRIBUTION, EXECUTED, LEFTOVER, Act, Agent, Obs
-from vlagents_ray.policies.adapters import ADAPTER, Adapters, require_base_alone
+from vlagents_ray.policies.adapters import ADAPTER, DIGITS, Adapters
 from vlagents_ray.policies.base.accelerator import free_memory, gpu_timer, is_out_of_memory, set_matmul
 from vlagents_ray.policies.base.checkpoint import find_adapter, used_checkpoints
 from vlagents_ray.policies.base.checkpoint_files import weights_of
@@ -42,6 +42,7 @@ from vlagents_ray.policies.compilation import Compilation, quantize, require_who
 from vlagents_ray.policies.loading import COMPILED_SIZES, LoadingReport, current_report, report_progress
 from vlagents_ray.policies.outcomes import attempt
 from vlagents_ray.validation import check_action
+from vlagents_ray.weights.trainable import from_host, named_values, to_host
 
 logger = logging.getLogger(__name__)
 
@@ -245,8 +246,11 @@ class ModelPolicy(Agent, abc.ABC):
 
     def sleep(self) -> None:
         self.compilation.drop_graphs()
+        if self.config.adapters:  # the server moves the trainable values alone
+            to_host([named_values(attrgetter(self.network or "")(self))], self.adapters.moved)
 
     def wake(self) -> None:
+        from_host(self.adapters.moved)
         if self.compilation.mode and not self.compilation.sizes:
             self._warm_up()
 
@@ -255,8 +259,7 @@ class ModelPolicy(Agent, abc.ABC):
 
     def _trainable(self) -> Any:
         require_whole(self.config.quantization)
-        require_base_alone(self.config.adapters)
-        return super()._trainable()
+        return self.adapters.trainable if self.config.adapters else super()._trainable()
 
     def adapt(self, adapter: str, folder: Path) -> None:
         """Check the files beside an adapter in its folder, and keep the statistics that normalise its rows.
@@ -277,6 +280,7 @@ class ModelPolicy(Agent, abc.ABC):
             find_adapter, checkpoint=self.config.checkpoint, base=base, digest_of_base=weights["digest"] or ""
         )
         self.adapters.load(attrgetter(self.network or "")(self), self.config.adapters, find, self.adapt)
+        self.adapters.base = (weights["digest"] or "").rpartition(":")[2][:DIGITS]
         self.weights_id = {**weights, "adapters": self.adapters.ids} if base else None
         return self.model
 

@@ -17,6 +17,7 @@ from typing import Any
 from vlagents_ray.contract import Contract, require_match
 from vlagents_ray.errors import UnknownSession
 from vlagents_ray.interface import Act, Agent, Obs
+from vlagents_ray.policies.adapters import DIGITS
 from vlagents_ray.policies.base.checkpoint import used_checkpoints
 from vlagents_ray.policies.base.checkpoint_files import weights_of
 from vlagents_ray.policies.base.program import Program, digest_of, files_named, with_defaults
@@ -28,7 +29,7 @@ from vlagents_ray.serve.models.agent_copies import AgentCopies
 from vlagents_ray.serve.models.checkpoints import CHOICE, Checkpoints, resolved
 from vlagents_ray.serve.queue.call_limits import LOAD, PolicyCall, PolicyCalls
 from vlagents_ray.serve.requests import CheckpointChoice
-from vlagents_ray.serve.weights import DIGITS, HoldsWeights, ModelWeights
+from vlagents_ray.serve.weights import HoldsWeights, ModelWeights
 from vlagents_ray.validation import check_observation
 
 logger = logging.getLogger(__name__)
