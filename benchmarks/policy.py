@@ -177,11 +177,11 @@ def main(
     out_file: Out = None,
 ) -> None:
     """Measure actions a second of one policy by batch size, bare and behind its batch queue, without Ray."""
-    from vlagents_ray.serve.launch.deployment_file import server_args  # which imports Ray for the schema of the file
+    from vlagents_ray.serve.launch.deployment_file import policy_application  # imports Ray, for the file's schema
 
     with errors():
         origin = measured_on("python -m benchmarks.policy")
-        args, batches = server_args(file, app), parse_counts(batch, "--batch")
+        args, batches = ServerArgs(**policy_application(file, app).args), parse_counts(batch, "--batch")
         args = args.model_copy(update={"config": args.config | parse_settings(settings, "--set")})
         plan = PolicyPlan(args, batches, seconds, rounds, image, parse_dims(state, "--state-dim"))
         found = measure_policy(plan, progress)

@@ -240,10 +240,10 @@ _ACTION_CURES = {
 }
 
 
-def require_match(policy: Contract | None, env: Contract | None) -> None:
-    """Raise `ContractMismatch` with every difference between the contracts of a policy and an env."""
+def require_match(policy: Contract | None, env: Contract | None, where: str = "") -> None:
+    """Raise `ContractMismatch` with every difference of a policy and an env; `where` names both in an evaluation."""
     if policy is not None and env is not None and (found := differences(policy, env)):
-        raise ContractMismatch("policy and env do not fit:\n" + "\n".join(f"- {line}" for line in found))
+        raise ContractMismatch(f"{where}policy and env do not fit:\n" + "\n".join(f"- {line}" for line in found))
 
 
 def closed(

@@ -10,7 +10,7 @@ from typing import Any, Union, get_args, get_origin, get_type_hints
 
 import numpy as np
 
-from vlagents_ray.errors import ConfigError
+from vlagents_ray.errors import ConfigError, shown
 from vlagents_ray.naming import did_you_mean
 
 _WANT = "Input should be "  # pydantic's wording
@@ -86,6 +86,9 @@ def _sentence(item: Mapping[str, Any], model: type | None, option: str | None) -
     name = str(item["loc"][-1]) if item["loc"] else ""
     beside = _fields(model, item["loc"][:-1])
     got = item["input"] if isinstance(item["input"], (bool, int, float)) else type(item["input"]).__name__
+    if item["type"] == "literal_error" and isinstance(item["input"], str):  # a word of a list is no secret
+        got = shown(item["input"])
+        message += did_you_mean(item["input"], item["ctx"]["expected"].split("'")[1::2])
     if message.startswith(_WANT):
         message = f"got {got}, want {message.removeprefix(_WANT)}"
     if item["type"] in ("model_type", "model_attributes_type", "dict_type"):

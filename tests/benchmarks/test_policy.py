@@ -17,7 +17,7 @@ from vlagents_ray.errors import ConfigError, InvalidObservation
 from vlagents_ray.interface import Act, Agent, Obs
 from vlagents_ray.policies.noop import Noop
 from vlagents_ray.serve.config.deployment import ServerArgs
-from vlagents_ray.serve.launch.deployment_file import server_args
+from vlagents_ray.serve.launch.deployment_file import policy_application
 
 
 class Picky(Noop):
@@ -79,10 +79,10 @@ def test_one_policy_of_a_file_is_named(tmp_path: Path) -> None:
     file = tmp_path / "two.yaml"
     app = "  - {{name: {0}, route_prefix: /{0}, import_path: vlagents_ray.serve.app:build, args: {{policy: {0}}}}}\n"
     file.write_text("applications:\n" + app.format("noop") + app.format("random"))
-    assert server_args(str(file), "random").policy == "random"
+    assert policy_application(str(file), "random").args["policy"] == "random"
     with pytest.raises(ConfigError, match=r"noop.*random"):
-        server_args(str(file))
-    assert server_args("noop").policy == "noop"
+        policy_application(str(file))
+    assert policy_application("noop").args["policy"] == "noop"
 
 
 def test_a_policy_is_measured_with_other_settings_than_its_files(tmp_path: Path) -> None:

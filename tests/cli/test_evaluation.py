@@ -257,5 +257,6 @@ def test_the_plan_is_printed_without_asking_any_policy(
     assert "4 cells" in text
     assert "20 episodes, 0 of them finished" in text
     assert "policy@20" in text
-    assert "and 4 cells whose envs were not played yet" in " ".join(text.split())
+    assert "unknown time" in text
+    assert "; 4 of 4 cells were not played yet" in " ".join(text.split())
     assert not settings.out.exists(), "nothing is written"

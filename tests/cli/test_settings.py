@@ -108,7 +108,20 @@ EVAL = ("--out", "runs/x", "--policy")
         (("eval", "libero/libero_spatail/1", *EVAL, "scripted"), "did you mean 'libero_spatial'"),
         (("eval", "libero/libero_spatial/12", *EVAL, "scripted"), "has no task '12': want 0 to 9, or a name"),
         (("eval", "tabletop", *EVAL, "scripted", "--worker-gpus", "0.5"), "a worker wants 0.5 GPUs, this"),
-        (("eval", "tabletop", *EVAL, "scripted", "--video", "alll"), "video: got str, want 'none', "),
+        (
+            ("eval", "tabletop", *EVAL, "scripted", "--video", "alll"),
+            "video: got 'alll', want 'none', 'failures' or 'all'; did you mean 'all'",
+        ),
+        (("eval", "my_policies:Reach", *EVAL, "scripted"), "my_policies:Reach': is no vlagents_ray.envs.EvalEnv"),
+        (
+            ("serve", "runs/act/last"),
+            "want a policy or a deployment file; .*lerobot.yaml --set checkpoint=runs/act/last",
+        ),
+        (("eval", "tabletop", *EVAL, "./typ.yaml"), "'./typ.yaml' does not exist in .*; did you mean 'typo.yaml'"),
+        (
+            ("eval", "tabletop", *EVAL, "deployments/act.yaml"),
+            "does not exist in .*; a checkout has some in deployments",
+        ),
         (("eval", "tabletop", "--policy", "scripted"), "error got no --out, want --out; or a file of runs"),
         (("eval", "tabletop", "--out", "runs/x"), "error got no --policy, want --policy; or a file of runs"),
         (("eval", "absent.yaml"), "'absent.yaml' does not exist"),

@@ -11,7 +11,8 @@ import yaml
 from typer.testing import CliRunner
 
 from vlagents_ray.cli.main import app
-from vlagents_ray.serve.launch.deployment_file import server_args
+from vlagents_ray.serve.config.deployment import ServerArgs
+from vlagents_ray.serve.launch.deployment_file import policy_application
 
 FILE = """\
 # What drives my robot
@@ -54,7 +55,7 @@ def test_the_settings_to_change_are_printed_with_the_figures(file: Path) -> None
     for section, values in settings.items():
         tuned["applications"][0]["args"].setdefault(section, {}).update(values)
     file.write_text(yaml.safe_dump(tuned))
-    args = server_args(str(file))
+    args = ServerArgs(**policy_application(str(file)).args)
     assert args.config["batch_sizes"][-1] == args.batch.max_size
 
 

@@ -175,6 +175,7 @@ def test_an_env_without_step_limit_asks_for_one() -> None:
     ("task", "options", "error", "message"),
     [
         ("NoSuchEnv-v0", {}, UnknownEnv, "NoSuchEnv"),
+        ("gymnasium/VlaArm-v0", {}, UnknownEnv, "gymnasium/MODULE:ID imports.*did you mean 'VlaArm-v0'"),
         (None, {}, UnknownEnv, "Pendulum"),
         ("VlaSwitch-v0", {}, ConfigError, "Discrete"),
         ("no_such_module/Env-v0", {}, MissingDependency, "no_such_module"),

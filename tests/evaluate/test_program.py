@@ -16,6 +16,7 @@ from vlagents_ray.evaluate import EvalConfig, Results, compare
 from vlagents_ray.evaluate.episode.records import EnvInfo, EpisodeResult
 from vlagents_ray.evaluate.exports.tables import rows
 from vlagents_ray.evaluate.merge import merge
+from vlagents_ray.evaluate.plan.cases import cells
 from vlagents_ray.evaluate.plan.jobs import plan
 from vlagents_ray.evaluate.results.store import Store
 from vlagents_ray.evaluate.results.summary import summarize
@@ -190,6 +191,12 @@ def test_installed_and_own_code_are_told_apart(work: Path) -> None:
     assert code_of_class("no_such_module:Policy") == {}
     [(name, version)] = code_of_class("pydantic:BaseModel").items()
     assert (name, version.startswith("version ")) == ("pydantic", True)
+
+
+@pytest.mark.parametrize("env", ["gymnasium/prog_env/Sea-v0", "gymnasium/prog_env:Sea-v0"])
+def test_the_module_that_registers_an_env_of_gymnasium_is_part_of_the_program(work: Path, env: str) -> None:
+    config = flat_config(envs=[env], episodes=1, policy="own", out=work / "out")
+    assert {name for cell in cells(config) for name in cell.program} >= ENV_FILES - {"chart.txt"}
 
 
 def test_a_checkpoint_is_found_at_its_step_and_the_working_folder_is_none(work: Path) -> None:

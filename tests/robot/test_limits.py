@@ -210,11 +210,11 @@ def test_the_tip_is_where_the_chain_of_transforms_puts_it(tmp_path: Path) -> Non
 @pytest.mark.parametrize(
     ("text", "said"),
     [
-        ("velocty: 3", "velocty"),
+        ("velocty: 3", "velocty.*did you mean 'velocity'"),
         ("velocity: [1", "line 1"),
         ("- 1", "TypeError"),
         ("velocity: fast", "fast"),
-        ("unit: grad", "grad"),
+        ("unit: grad", "unit: got 'grad', want 'rad' or 'deg'"),
         ("urdf: none.urdf", "none.urdf"),
     ],
 )

@@ -312,8 +312,7 @@ def print_plan(config: EvalConfig) -> None:
             str(one.cell.planned),
             str(one.finished),
             str(one.left),
-            "?" if one.seconds is None else f"{one.seconds:.3g}",
-            "?" if one.seconds is None else _time(one.left * one.seconds),
+            *(("?", "?") if one.seconds is None else (f"{one.seconds:.3g}", _time(one.left * one.seconds))),
         )
     out.print(shown)
     cases = [one.cell for one in found]
@@ -324,11 +323,12 @@ def print_plan(config: EvalConfig) -> None:
     workers = chosen_workers(config)
     seconds = sum(one.left * (one.seconds or 0.0) for one in found) / max(1, min(workers, left))
     unknown = sum(one.seconds is None for one in found)
-    beside = f", and {unknown} cells whose envs were not played yet" if unknown else ""
+    beside = f"; {unknown} of {len(found)} cells were not played yet" if unknown else ""
     out.print(f"{len(found)} cells: {policies} policies at their checkpoints x {envs} environments of suites")
     out.print(f"{planned} episodes, {finished} of them finished in {config.out}, {left} to play")
     where = f"with {workers} workers" if workers else "in one process, without Ray"
-    out.print(f"{_time(seconds)} {where}, as long as episodes before{beside}")
+    time = "unknown time" if unknown == len(found) else f"{_time(seconds)} as by earlier episodes"
+    out.print(f"{time} {where}{beside}")
 
 
 def forecasts(planned: Sequence[EvalCase], results: Results | None) -> list[Forecast]:

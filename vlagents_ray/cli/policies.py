@@ -17,7 +17,7 @@ from vlagents_ray.cli.ray_session import RESUME, exit_if_ray_is_lost, quiet_ray
 from vlagents_ray.client.agent import RemoteAgent
 from vlagents_ray.contract import require_match
 from vlagents_ray.envs.base import known_contract
-from vlagents_ray.errors import ConfigError, ContractMismatch
+from vlagents_ray.errors import ConfigError
 from vlagents_ray.evaluate import EvalConfig, PolicyConfig, check
 from vlagents_ray.evaluate.plan.cases import cells
 from vlagents_ray.evaluate.workers.base import chosen_workers
@@ -98,10 +98,7 @@ def _require_fit(config: EvalConfig, parts: Mapping[str, Deployment]) -> None:
     for cell in cells(config) if config.real_robot is None else ():
         application = str(cell.policy.url).removeprefix("serve://")
         if application in parts and (env := known_contract(cell.env, cell.suite.env_options)) is not None:
-            try:
-                require_match(policy_contract(application), env)
-            except ContractMismatch as error:
-                raise ContractMismatch(f"{cell.policy.name!r} in {cell.env!r}: {error}") from None
+            require_match(policy_contract(application), env, f"{cell.policy.name!r} in {cell.env!r}: ")
 
 
 def _play_here(

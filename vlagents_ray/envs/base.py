@@ -248,25 +248,25 @@ def make_env(name: str, **options: Any) -> EvalEnv:
         EnvFailed: The simulator or its assets cannot be loaded.
     """
     cls, arguments = env_arguments(name, options)
-    env: EvalEnv = cls(**arguments)
-    return env
+    return cls(**arguments)
 
 
 def env_arguments(name: str, options: Mapping[str, Any]) -> tuple[type[EvalEnv], dict[str, Any]]:
     """Return the class of the env `name` and its constructor's arguments; raises the errors of `make_env`."""
     cls = env_class(name)
+    if not issubclass(cls, EvalEnv):
+        raise UnknownEnv(
+            f"env {name!r}: is no vlagents_ray.envs.EvalEnv; name a class of Gymnasium gymnasium/MODULE:ID"
+        )
     task = env_task(name)
     arguments = {"task": task, **options} if task is not None else dict(options)
     require_arguments(f"env {name!r}", cls, arguments)
-    if issubclass(cls, EvalEnv):
-        cls.require_task(arguments.get("task"))
+    cls.require_task(arguments.get("task"))
     return cls, arguments
 
 
 def known_contract(name: str, options: Mapping[str, Any]) -> Contract | None:
     """Return the contract of the env `name` without making it; None if it cannot state one yet."""
-    if not issubclass(env_class(name), EvalEnv):
-        return None
     cls, arguments = env_arguments(name, options)
     bound = inspect.signature(cls).bind(**arguments)
     bound.apply_defaults()

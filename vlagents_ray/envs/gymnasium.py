@@ -21,6 +21,7 @@ from vlagents_ray.envs.graphics import prepare_rendering
 from vlagents_ray.envs.simulator import BenchmarkProtocol, without
 from vlagents_ray.errors import ConfigError, EnvFailed, MissingDependency, NotReset, UnknownEnv, VLAgentsError
 from vlagents_ray.interface import Act, Obs
+from vlagents_ray.naming import did_you_mean
 from vlagents_ray.registry import require
 
 TERMINATED = "terminated"
@@ -242,10 +243,8 @@ class Gymnasium(EvalEnv):
         # pygame, the renderer of several environments, otherwise prints a greeting on import
         os.environ.setdefault("PYGAME_HIDE_SUPPORT_PROMPT", "1")
         gymnasium = require("gymnasium")
-        module = self._module
-        if module is None and "/" in self._id and self._id not in gymnasium.registry:
-            module = self._id.partition("/")[0]
-        if module is not None:
+        namespace = "" if self._id in gymnasium.registry else self._id.rpartition("/")[0].partition(":")[0]
+        if module := self._module or namespace:
             require(module)
         arguments = {"render_mode": "rgb_array", "disable_env_checker": True, **self._kwargs}
         try:
@@ -253,7 +252,8 @@ class Gymnasium(EvalEnv):
         except gymnasium.error.DependencyNotInstalled as error:
             raise MissingDependency(f"{self._name}: {error}") from error
         except gymnasium.error.UnregisteredEnv as error:
-            raise UnknownEnv(f"{self._name}: {error}; set `module` to what registers it") from error
+            meant = did_you_mean(self._id.rpartition("/")[2], gymnasium.registry)
+            raise UnknownEnv(f"{self._name}: {error}; gymnasium/MODULE:ID imports what registers it{meant}") from error
         except gymnasium.error.Error as error:
             raise ConfigError(f"{self._name}: {error}") from error
         except TypeError as error:

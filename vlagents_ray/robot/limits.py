@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 
 from vlagents_ray.errors import ConfigError
+from vlagents_ray.naming import did_you_mean
 from vlagents_ray.registry import require
 
 Numbers = float | tuple[float, ...]  # one for all numbers of an action, or one for each
@@ -59,12 +60,14 @@ class Limits:
                 return cls._of_urdf(path, (), None, 1.0)
             given = _document(path)
             urdf, tip = given.pop("urdf", None), given.pop("tip", None)
-            known = {one.name for one in fields(cls)} - {"chain"}
+            known = {one.name for one in fields(cls)} - {"chain"} | {"urdf", "tip"}
             if unknown := sorted(set(given) - known):
-                raise ConfigError(f"{path}: unknown keys {unknown}, want some of {sorted(known | {'urdf', 'tip'})}")
+                meant = "".join(did_you_mean(str(key), known) for key in unknown)
+                raise ConfigError(f"{path}: unknown keys {unknown}, want some of {sorted(known)}{meant}")
             values = {key: _tuple(value, -math.inf if key == "low" else math.inf) for key, value in given.items()}
             limits = cls(**values)
-            scale = {"rad": 1.0, "deg": 180 / math.pi}[limits.unit]
+            if (scale := {"rad": 1.0, "deg": 180 / math.pi}.get(limits.unit)) is None:
+                raise ConfigError(f"{path}: unit: got {limits.unit!r}, want 'rad' or 'deg'")
             for key in ("low", "high", "velocity", "acceleration", "jerk", "first", "rest"):
                 np.asarray(getattr(limits, key) or 0.0, np.float64)
             if urdf is None:

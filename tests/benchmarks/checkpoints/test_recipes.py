@@ -13,7 +13,8 @@ from benchmarks.checkpoints import recipes
 from benchmarks.checkpoints.recipe import Recipe, WrittenCheckpoint
 from benchmarks.checkpoints.recipes import FAMILIES, Family, write_checkpoint
 from vlagents_ray.errors import ConfigError, MissingDependency
-from vlagents_ray.serve.launch.deployment_file import server_args
+from vlagents_ray.serve.config.deployment import ServerArgs
+from vlagents_ray.serve.launch.deployment_file import policy_application
 
 ROOT = Path(__file__).parents[3]
 Known = Callable[..., list[Recipe]]
@@ -45,7 +46,7 @@ def test_the_deployment_file_serves_the_checkpoint_with_this_python(tmp_path: Pa
     asked = known()
     written = write_checkpoint("own", tmp_path / "made", "small")
     assert asked == [Recipe("own", tmp_path / "made", "small", "bfloat16")]
-    args = server_args(str(tmp_path / "made" / "deployment.yaml"))
+    args = ServerArgs(**policy_application(str(tmp_path / "made" / "deployment.yaml")).args)
     assert (args.policy, args.config) == (written.policy, written.config)
     assert args.environment.python == sys.executable
     assert args.batch.max_size == 32

@@ -112,7 +112,8 @@ def env_program(cell: EvalCase, code: Callable[[str], Program] = code_of_class) 
         return code(cell.on_robot[0].arm or "")
     cls = env_class(cell.env)
     settings = with_defaults(cls, cell.suite.env_options) | {"reset_options": cell.suite.reset_options}
-    namespace = (env_task(cell.env) or "").rpartition("/")[0]  # of an id of Gymnasium; this module registers it
+    task = env_task(cell.env) or ""
+    namespace = task.rpartition(":")[0] or task.rpartition("/")[0]  # of an id of Gymnasium; this module registers it
     modules = [f"{cls.__module__}:{cls.__name__}", cell.suite.env_options.get("module") or namespace]
     found = {name: digest for module in modules if isinstance(module, str) for name, digest in code(module).items()}
     return found | files_named(settings, folders=False)

@@ -155,7 +155,7 @@ class Rollout:
             )
         agent, env = self._agent, self._env
         if found:
-            require_match(agent.contract, env.contract)
+            require_match(agent.contract, env.contract, f"{cell.policy.name!r} in {cell.env!r}: ")
             if (renderer := env.renderer()) is not None:
                 require_own(renderer)
             name, where = None if renderer is None else renderer.name, (socket.gethostname(), this_node(), os.getpid())

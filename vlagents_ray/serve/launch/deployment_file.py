@@ -11,7 +11,8 @@ import yaml
 from pydantic import BaseModel, Field, ValidationError
 
 from vlagents_ray.contract import Contract
-from vlagents_ray.errors import ConfigError
+from vlagents_ray.errors import ConfigError, UnknownPolicy
+from vlagents_ray.naming import did_you_mean
 from vlagents_ray.policies.base.checkpoint import STEP as STEP_PLACE
 from vlagents_ray.policies.wrapper import build_agent, unloaded_contract
 from vlagents_ray.ray_tools.runtime_env import require_no_secrets
@@ -91,8 +92,11 @@ def read_deployment(
     path = Path(source)
     if path.suffix in (".yaml", ".yml"):
         if not path.is_file():
-            where = "" if path.is_absolute() else f" in {Path.cwd()}; those of this project are in its checkout"
-            raise ConfigError(f"deployment file {source!r} does not exist{where}")
+            where = "" if path.is_absolute() else f" in {Path.cwd()}"
+            meant = (
+                did_you_mean(source, map(str, path.parent.glob("*.y*ml"))) or "; a checkout has some in deployments/"
+            )
+            raise ConfigError(f"deployment file {source!r} does not exist{where}{meant}")
         if overrides:
             raise ConfigError(f"{source!r} holds the settings; edit it instead of giving {sorted(overrides)}")
         try:
@@ -101,13 +105,13 @@ def read_deployment(
             raise ConfigError(f"{source}: not YAML ({error})") from error
         return _checked(document, source, step_follows)
     if ":" not in source and source not in names("policies"):
+        if "/" in source:
+            raise UnknownPolicy(
+                f"policy: got {source!r}, want a policy or a deployment file; for a checkpoint, give the file of its "
+                f"family, as in deployments/lerobot.yaml --set checkpoint={source}"
+            )
         policy_class(source)  # raises an error with the list of choices
     return _of_name(source, overrides or {}, step_follows)
-
-
-def server_args(source: str, app: str | None = None) -> ServerArgs:
-    """Return the settings of one policy of a deployment: that of the application `app`, or of the only one."""
-    return ServerArgs(**policy_application(source, app).args)
 
 
 def policy_application(source: str, app: str | None = None) -> Application:
