@@ -99,6 +99,14 @@ def test_pages_fit_and_ask_for_nothing_outside_of_the_site(page: Page, width: in
 
 
 @pytest.mark.browser
+@pytest.mark.parametrize("scheme", ["light", "dark"])
+def test_the_picture_of_the_report_has_the_readers_colours(page: Page, scheme: str) -> None:
+    page.open(SITE / "evaluation/reading.html", width=1280, scheme=scheme)
+    shown = "[...document.images].filter(one => one.naturalWidth).map(one => one.currentSrc)"
+    assert page.value(shown) == [(SITE / f"evaluation/report-{scheme}.png").as_uri()]
+
+
+@pytest.mark.browser
 def test_the_search_finds_pages_without_a_server(page: Page) -> None:
     page.open(SITE / "index.html", width=1280, scheme="light")
     page.value('document.querySelector(".md-search__input").focus()')
