@@ -20,7 +20,7 @@ from vlagents_ray.envs.tabletop import Tabletop
 from vlagents_ray.evaluate import EvalConfig
 from vlagents_ray.registry import POLICIES, WRAPPERS
 
-ARM = "import numpy as np\nfrom vlagents_ray import Obs\nclass Arm:\n    def observe(self): return Obs(gripper=1.0)\n"
+ARM = "import numpy as np\nfrom vlagents_ray import Obs\nclass Arm:\n    def observe(self): return Obs(gripper=50.0)\n"
 ARM += "    def apply(self, action): pass\n    def stop(self): pass\n"
 
 
