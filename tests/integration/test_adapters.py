@@ -1,6 +1,6 @@
 """A server of two LoRA adapters over one base: sessions of both act in one pass, each as its fine-tune alone.
 
-A learner pushes the values of one adapter to both replicas of another server.
+A learner pushes the values of one of them.
 """
 
 from __future__ import annotations
@@ -56,13 +56,6 @@ def server(shared_ray: None, folder: Path, values: dict[str, dict[str, np.ndarra
         yield server
 
 
-@pytest.fixture
-def replicas(shared_ray: None, folder: Path, values: dict[str, dict[str, np.ndarray]]) -> Iterator[Server]:
-    config = {"checkpoint": str(folder), "adapters": {name: str(folder.parent / name) for name in values}}
-    with serving("adapted_network:Small", name="replicas", config=config, replicas=2) as server:
-        yield server
-
-
 def at(seed: int) -> Obs:
     return Obs(state={"joints": np.random.default_rng(seed).normal(size=DIM).astype(np.float32)})
 
@@ -94,30 +87,35 @@ def test_sessions_of_two_adapters_act_in_one_batch_as_each_merged_alone(
         np.testing.assert_allclose(act.action, alone.act(at(10 + seed)).action, rtol=1e-5, atol=1e-5)
 
 
-def played(server: Server, adapter: str | None) -> tuple[bytes, dict[str, Any]]:
+def played(server: Server, **options: Any) -> tuple[bytes, dict[str, Any]]:
     """The first action of an episode, and the weights that it states."""
     with RemoteAgent(server.url, transport="http", rank="simulation") as agent:
-        agent.reset(at(0), None, seed=0, adapter=adapter)
+        agent.reset(at(0), None, seed=0, **options)
         act = agent.act(at(1))
         return act.action.tobytes(), act.info["policy"]
 
 
-def test_a_pushed_adapter_acts_on_both_replicas_and_the_others_as_before(
-    replicas: Server, folder: Path, values: dict[str, dict[str, np.ndarray]]
+def test_an_adapter_that_is_pushed_over_the_network_acts_as_the_saved_one(
+    server: Server, folder: Path, values: dict[str, dict[str, np.ndarray]]
 ) -> None:
-    before = {name: played(replicas, name) for name in ("pour", None)}
-    trained = pairs(policy(folder).model, LAYERS, RANKS["stack"], seed=9)
-    with Publisher(replicas.url) as weights:
-        version = weights.push({f"stack/{name}": value for name, value in trained.items()}, partial=True)
-        assert weights.acknowledged(version) == 2
+    before = {name: played(server, checkpoint=name) for name in RANKS}
+    plain, trained = played(server), pairs(policy(folder).model, LAYERS, RANKS["stack"], seed=9)
+    with Publisher(server.url) as weights:
+        version = weights.push(named(trained), partial=True)
         with pytest.raises(InvalidWeights, match=r"unknown, want one of the policy's 16 names"):
             weights.push({f"fold/{name}": value for name, value in trained.items()}, partial=True)
-    save(folder.parent / "trained", trained)
-    alone = Small.from_config({"checkpoint": str(folder), "adapters": {"stack": str(folder.parent / "trained")}})
-    alone.initialize()
-    alone.reset(at(0), None, seed=0, adapter="stack")
-    wanted, (_, stated) = alone.act(at(1)).action.tobytes(), played(replicas, "stack")
-    assert [played(replicas, "stack") for _ in range(6)] == 6 * [(wanted, stated)]
-    assert stated["version"] == version
-    assert played(replicas, "pour") == (before["pour"][0], stated)
-    assert played(replicas, None) == before[None]
+        save(folder.parent / "trained", trained)
+        alone = Small.from_config({"checkpoint": str(folder), "adapters": {"stack": str(folder.parent / "trained")}})
+        alone.initialize()
+        alone.reset(at(0), None, seed=0, adapter="stack")
+        action, stated = played(server, checkpoint="stack")
+        assert action == alone.act(at(1)).action.tobytes() != before["stack"][0]
+        assert stated["version"] == version
+        assert played(server, checkpoint="pour") == (before["pour"][0], stated)
+        assert played(server) == plain
+        weights.push(named(values["stack"]), partial=True)
+        assert played(server, checkpoint="stack")[0] == before["stack"][0]
+
+
+def named(values: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+    return {f"stack/{name}": value for name, value in values.items()}

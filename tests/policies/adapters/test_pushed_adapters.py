@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -13,11 +14,12 @@ from gain_policies import in_child
 from in_flight import answered
 
 from vlagents_ray import Agent, Obs
-from vlagents_ray.errors import InvalidWeights
+from vlagents_ray.errors import InvalidWeights, UnchangedWeights
 from vlagents_ray.interface import Act
 from vlagents_ray.learn import Publisher
 from vlagents_ray.protocol.messages import Request
 from vlagents_ray.serve.engine.engine import Engine
+from vlagents_ray.serve.scaling.weight_push import ThisReplica, WeightPusher
 from vlagents_ray.serve.weights import PushOptions
 from vlagents_ray.weights import trainable
 from vlagents_ray.weights.trainable import fingerprint
@@ -118,6 +120,30 @@ def test_a_pushed_adapter_acts_as_the_saved_one_and_all_else_as_before(
     assert {name: action for name, (action, _) in played(engine).items()} == {
         name: one for name, (one, _) in before.items()
     }
+
+
+@pytest.mark.parametrize("refused", [False, True])
+def test_all_replicas_act_with_it_or_none(
+    tmp_path: Path, values: dict[str, dict[str, np.ndarray]], serving: Callable[[Agent], Engine], refused: bool
+) -> None:
+    own, other = (serving(Small.from_config(settings(tmp_path, stack="stack", pour="pour"))) for _ in range(2))
+    if refused:  # by the other one, which has these values already
+        Publisher(other).push(pushed(values["trained"]), partial=True)
+    before = [played(engine) for engine in (own, other)]
+
+    async def others() -> list[ThisReplica]:
+        return [ThisReplica("other", other.weights)]
+
+    pushing = WeightPusher(ThisReplica("own", own.weights), others).push(
+        pushed(values["trained"]), PushOptions(partial=True)
+    )
+    if refused:
+        with pytest.raises(UnchangedWeights):
+            asyncio.run(pushing)
+        assert [played(engine) for engine in (own, other)] == before
+    else:
+        assert asyncio.run(pushing).replicas == ("other", "own")
+        assert played(own) == played(other) != before[0]
 
 
 def test_a_replica_that_starts_later_states_and_does_the_same(
