@@ -265,3 +265,12 @@ def test_an_unknown_field_is_refused_with_those_that_there_are(cls: type, wrong:
 def test_another_error_of_a_constructor_is_the_same_as_without_the_list_of_fields() -> None:
     with pytest.raises(TypeError, match="missing 1 required positional argument: 'action'"):
         Act()  # type: ignore[call-arg]
+
+
+def test_a_tensor_that_numpy_cannot_read_is_no_action() -> None:
+    class RequiresGrad:
+        def __array__(self, *_: object, **__: object) -> np.ndarray:
+            raise RuntimeError("Can't call numpy() on Tensor that requires grad")
+
+    with pytest.raises(InvalidAction, match="got RequiresGrad, want"):
+        check_action(RequiresGrad(), None)

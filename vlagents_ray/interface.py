@@ -196,7 +196,10 @@ class Agent:
                 f"{type(self).__name__}: names no parameters to train; set `trainable` to the name of the attribute "
                 f"with its torch module or its dicts of arrays"
             )
-        return attrgetter(self.trainable)(self)
+        try:
+            return attrgetter(self.trainable)(self)
+        except AttributeError as error:
+            raise NotTrainable(f"trainable: {error}; call initialize() first, or correct the name") from error
 
     @property
     def contract(self) -> Contract | None:

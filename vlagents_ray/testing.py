@@ -168,15 +168,14 @@ def check_agent(
     Raises:
         ContractViolation: The agent does not implement the interface; the message names the place.
     """
+    if not isinstance(agent, Agent):
+        raise ContractViolation(f"agent: got {agent!r}, want an object of a class that derives from vlagents_ray.Agent")
     agent.initialize()
     contract = agent.contract
     if contract is not None and not isinstance(contract, Contract):
         raise ContractViolation(f"contract: got {type(contract).__name__}, want a Contract or None")
-    views = (
-        [obs]
-        if isinstance(obs, Obs)
-        else list(obs or [random_observation(contract, seed) for seed in range(_SESSIONS)])
-    )
+    views = [obs] if isinstance(obs, Obs) else list(obs or ())
+    views = views or [random_observation(contract, seed) for seed in range(_SESSIONS)]
     suite = _AgentSuite(agent, contract, views, instructions, dict(reset_kwargs or {}))
 
     alone = [suite.play_alone(i, steps) for i in range(_SESSIONS)]
@@ -415,6 +414,8 @@ def check_env(
     Raises:
         ContractViolation: The environment does not implement the interface; the message names the place.
     """
+    if not isinstance(env, EvalEnv):
+        raise ContractViolation(f"env: got {env!r}, want an EvalEnv; make one of Gymnasium by make_env('gymnasium/ID')")
     contract = env.contract
     if not isinstance(contract, Contract):
         raise ContractViolation(f"contract: got {type(contract).__name__}, want a Contract")

@@ -67,7 +67,7 @@ def check_action(action: object, contract: Contract | None) -> np.ndarray:
     """Return the action as (D,) or (H, D) float32; raises `InvalidAction` if it must not be sent to a robot."""
     try:
         array = np.ascontiguousarray(action, dtype=_FLOAT32)
-    except (TypeError, ValueError) as error:
+    except (TypeError, ValueError, RuntimeError) as error:  # RuntimeError: a torch tensor that requires grad
         raise InvalidAction(f"action: got {_describe(action)}, want (D,) or (H, D) float32") from error
     if array.ndim not in (1, 2) or array.size == 0:
         raise InvalidAction(f"action: got {_describe(action)}, want (D,) or (H, D) float32")

@@ -432,7 +432,9 @@ def test_options_are_checked_before_a_server_is_asked(
     except SystemExit as ended:
         status = ended.code
     assert status == 2
-    assert wanted in capsys.readouterr().err
+    said = capsys.readouterr().err
+    assert wanted in said
+    assert said.count("\n") <= 2, "an error does not list all options"
 
 
 def test_an_address_that_is_none_is_refused(capsys: pytest.CaptureFixture[str]) -> None:

@@ -112,15 +112,18 @@ EVAL = ("--out", "runs/x", "--policy")
             ("eval", "tabletop", *EVAL, "scripted", "--video", "alll"),
             "video: got 'alll', want 'none', 'failures' or 'all'; did you mean 'all'",
         ),
-        (("eval", "my_policies:Reach", *EVAL, "scripted"), "my_policies:Reach': is no vlagents_ray.envs.EvalEnv"),
+        (
+            ("eval", "my_policies:Reach", *EVAL, "scripted"),
+            "my_policies:Reach': is no EvalEnv; an environment of Gymnasium is named",
+        ),
         (
             ("serve", "runs/act/last"),
             "want a policy or a deployment file; .*lerobot.yaml --set checkpoint=runs/act/last",
         ),
-        (("eval", "tabletop", *EVAL, "./typ.yaml"), "'./typ.yaml' does not exist in .*; did you mean 'typo.yaml'"),
+        (("eval", "tabletop", *EVAL, "./typ.yaml"), "/typ.yaml does not exist; did you mean 'typo.yaml'"),
         (
             ("eval", "tabletop", *EVAL, "deployments/act.yaml"),
-            "does not exist in .*; a checkout has some in deployments",
+            "deployments/act.yaml does not exist; a checkout has deployments/",
         ),
         (("eval", "tabletop", "--policy", "scripted"), "error got no --out, want --out; or a file of runs"),
         (("eval", "tabletop", "--out", "runs/x"), "error got no --policy, want --policy; or a file of runs"),

@@ -204,6 +204,13 @@ def test_weights_that_nobody_names_are_refused(plan: EvalConfig) -> None:
         TrainingEvaluation(ToZero(), plan).play(1)
 
 
+def test_an_agent_that_is_not_initialized_and_a_model_without_one_are_refused(plan: EvalConfig) -> None:
+    with pytest.raises(NotTrainable, match=r"trainable: 'Proportional' object has no .*; call initialize\(\) first"):
+        TrainingEvaluation(Proportional(), plan).play(1)
+    with pytest.raises(ConfigError, match="policy: got dict, want an Agent, or the URL of its server"):
+        TrainingEvaluation({}, plan)  # type: ignore[arg-type]
+
+
 @pytest.mark.parametrize(
     ("changes", "share", "error"),
     [

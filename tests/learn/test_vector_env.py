@@ -199,6 +199,18 @@ def test_a_size_that_the_contract_leaves_open_is_an_error_that_names_it() -> Non
         observation_space(gymnasium.spaces, Contract(), "state")
 
 
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        ({"observation": "states"}, r"observation: got 'states', want one of \['all', 'state'\]"),
+        ({"autoreset": "none"}, "autoreset: got 'none', want one of .*'disabled'"),
+    ],
+)
+def test_an_unknown_word_is_refused_with_the_known_ones(words: dict[str, Any], said: str) -> None:
+    with pytest.raises(ConfigError, match=said):
+        as_vector_env("tabletop", **words)
+
+
 def test_wrong_actions_and_a_step_before_the_reset_are_errors() -> None:
     venv = of(Line, 2)
     with pytest.raises(NotReset, match="reset"):

@@ -11,7 +11,7 @@ from pydantic import BaseModel
 
 from vlagents_ray import Act, Agent, Obs
 from vlagents_ray.contract import ActionSpec, Contract
-from vlagents_ray.errors import ConfigError, InvalidObservation, NotTrainable, PolicyFailed
+from vlagents_ray.errors import ConfigError, InvalidObservation, NotTrainable, PolicyFailed, UnknownPolicy
 from vlagents_ray.policies.wrapper import Wrapper, build_agent
 from vlagents_ray.serve.models.agent_copies import AgentCopies
 from vlagents_ray.testing import check_agent
@@ -126,6 +126,11 @@ def test_the_first_wrapper_is_the_nearest_to_the_robot() -> None:
 def test_wrong_entries_are_refused(wrappers: list[Any], said: str) -> None:
     with pytest.raises(ConfigError, match=said):
         build_agent(BRIGHT, {}, wrappers)
+
+
+def test_a_class_that_is_no_agent_is_refused() -> None:
+    with pytest.raises(UnknownPolicy, match="'json:JSONDecoder': is no Agent; derive the class"):
+        build_agent("json:JSONDecoder", {})
 
 
 def test_what_keeps_the_inner_agent_from_acting_is_said_by_the_wrapper_too() -> None:

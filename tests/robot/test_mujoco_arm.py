@@ -1,5 +1,7 @@
 """Arms in MuJoCo: names, files, units, and a stop."""
 
+import subprocess
+import sys
 from contextlib import closing
 from pathlib import Path
 
@@ -78,3 +80,9 @@ def test_a_wrong_model_is_an_error_with_its_cure(tmp_path: Path, monkeypatch: py
     monkeypatch.setenv("MENAGERIE_ROOT", str(tmp_path))
     with pytest.raises(ConfigError, match="MENAGERIE_ROOT names a folder"):
         MujocoArm("so101")
+
+
+def test_the_module_chooses_the_renderer_before_a_package_of_models_imports_mujoco() -> None:
+    script = "import os, vlagents_ray.robot.mujoco_arm; print(os.environ['MUJOCO_GL'])"
+    done = subprocess.run([sys.executable, "-c", script], env={}, capture_output=True, text=True, check=True)
+    assert done.stdout == "egl\n"

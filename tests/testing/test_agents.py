@@ -269,6 +269,11 @@ def test_a_broken_agent_is_told_what_is_wrong(cls: type[GoodAgent], message: str
         check_agent(cls())
 
 
+def test_a_class_in_place_of_its_object_is_refused() -> None:
+    with pytest.raises(ContractViolation, match="want an object of a class that derives from"):
+        check_agent(GoodAgent)  # type: ignore[arg-type]
+
+
 def test_instructions_that_the_policy_knows_can_be_given() -> None:
     check_agent(ParsesItsInstruction(), instructions=["go home"])
 

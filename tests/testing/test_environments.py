@@ -215,6 +215,13 @@ def test_a_broken_env_is_told_what_is_wrong(cls: type[GoodEnv], message: str) ->
         check_env(cls())
 
 
+def test_an_object_that_is_no_env_of_ours_is_refused() -> None:
+    with pytest.raises(
+        ContractViolation, match=r"want an EvalEnv; make one of Gymnasium by make_env\('gymnasium/ID'\)"
+    ):
+        check_env(object())  # type: ignore[arg-type]
+
+
 def test_an_env_whose_steps_are_not_reproducible_passes_if_told_so() -> None:
     check_env(CarriesOver(), same_steps=False)
 

@@ -276,6 +276,7 @@ def command_parser() -> tuple[argparse.ArgumentParser, list[argparse.Action], li
     parser = argparse.ArgumentParser(
         prog="vlagents-ray robot", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
+    parser.usage = "vlagents-ray robot [http://HOST:PORT] [OPTION ...]"  # else each error lists all options
     groups = parser.add_argument_group("a robot"), parser.add_argument_group("a simulation")
     of_robot: list[argparse.Action] = []
     of_env: list[argparse.Action] = []
@@ -289,8 +290,7 @@ def command_parser() -> tuple[argparse.ArgumentParser, list[argparse.Action], li
     def simulated(*names: str, **settings: Any) -> None:
         of_env.append(groups[1].add_argument(*names, **settings))
 
-    policy = "URL of its server: http://gpu-box:8000; with --env also a registered policy, 'module:Class', or nothing"
-    add("policy", nargs="?", help=policy)
+    add("policy", nargs="?", help="URL of its server; with --env also a registered policy, 'module:Class', or nothing")
     add("--hz", type=seconds, help=f"control rate (default: {_HZ:g}, or the environment's)")
     real("--seconds", type=seconds, default=60.0, help="how long (%(default)s)")
     real("--instruction", help="the task in words")
@@ -303,32 +303,24 @@ def command_parser() -> tuple[argparse.ArgumentParser, list[argparse.Action], li
     add("--execute", type=rows, metavar="N", help="rows of a chunk to execute before asking again")
     real("--horizon", type=rows, metavar="N", help="rows of a chunk that may be executed at all")
     real("--max-age-s", type=seconds, metavar="S", help="largest age of the observation of an executed action")
-    merges = (*MERGES, ENSEMBLE)
-    real("--merge", choices=merges, default="newest", help="how overlapping chunks are merged (%(default)s)")
+    real("--merge", choices=(*MERGES, ENSEMBLE), default="newest", help="how overlapping chunks merge (%(default)s)")
     real("--rtc", action="store_true", help="real-time chunking: send the rest of the plan, and the delay")
-    waits = f"how long a tick may wait for an action (async: 0, else {WAIT_S * 1e3:.0f})"
-    real("--deadline-ms", type=_number(), help=waits)
-    safe = "the action of a tick without one of the policy (%(default)s: by contract)"
-    real("--safe", choices=("auto", "hold", "zero"), default="auto", help=safe)
+    real("--deadline-ms", type=_number(), help=f"wait of a tick for an action (async: 0, else {WAIT_S * 1e3:.0f})")
+    real("--safe", choices=("auto", "hold", "zero"), default="auto", help="at a tick without an action (%(default)s)")
     add("--max-step", type=_number(), help="largest change of a number of the action from one tick to the next")
     real("--measure", metavar="PART", help="part of the state with the measured pose, for --max-step, e.g. joints")
-    limits = "limits of motion: a .yaml or .json file, a LeRobotDataset or a .urdf; see docs/control_loop.md"
-    add("--limits", metavar="PATH", help=limits)
-    soft = "time of motion in which these rise from half of their values (%(default)s; 0: none)"
-    add("--soft-start-s", type=_number(), default=SOFT_START_S, help=soft)
+    add("--limits", metavar="PATH", help="limits of motion: .yaml, .json, .urdf or dataset; see docs/control_loop.md")
+    add("--soft-start-s", type=_number(), default=SOFT_START_S, help="in which these rise from half (%(default)s)")
     trained = "file with statistics of the training, which arm and first chunk must fit (default: the server's, if any)"
     real("--trained-on", metavar="FILE", help=trained)
     real("--accept-misfit", action="store_true", help="move although they do not fit; the log shows it")
-    restarts = "how motion restarts after a stop: by Enter, C or SIGUSR1, or by itself (manual; auto if simulated)"
-    real("--restart", choices=get_args(Restart), help=restarts)
-    silence = "stop the robot when the server is silent this long (%(default)s)"
-    real("--silent-s", type=seconds, default=2.0, help=silence)
+    real("--restart", choices=get_args(Restart), help="after a stop: by Enter, C or SIGUSR1; if simulated: auto")
+    real("--silent-s", type=seconds, default=2.0, help="stop the robot if the server is silent this long (%(default)s)")
     real("--timeout-s", type=seconds, default=10.0, help="time after which a request is given up (%(default)s)")
     real("--transport", choices=("auto", "shm", "websocket", "http"), default="auto", help="(%(default)s)")
     add("--record", metavar="DIR", help="record a LeRobotDataset v3.0 there; needs the extra 'record'")
     add("--rerun", metavar="DIR", help="write a .rrd file there for Rerun, or 'live': show the run in its viewer")
-    buttons = "obey the buttons of the server's live page: pause, stop, success, failure"
-    real("--operate", action="store_true", help=buttons)
+    real("--operate", action="store_true", help="obey the server's live page: pause, stop, success, failure")
     real("--real-time", action="store_true", help="ask for SCHED_FIFO in place of a nice value")
     groups[1].add_argument("--env", metavar="NAME", help="the environment: tabletop, maniskill/PickCube-v1, …")
     settings: dict[str, Any] = {"action": "append", "metavar": "KEY=VALUE", "default": []}

@@ -255,9 +255,7 @@ def env_arguments(name: str, options: Mapping[str, Any]) -> tuple[type[EvalEnv],
     """Return the class of the env `name` and its constructor's arguments; raises the errors of `make_env`."""
     cls = env_class(name)
     if not issubclass(cls, EvalEnv):
-        raise UnknownEnv(
-            f"env {name!r}: is no vlagents_ray.envs.EvalEnv; name a class of Gymnasium gymnasium/MODULE:ID"
-        )
+        raise UnknownEnv(f"env {name!r}: is no EvalEnv; an environment of Gymnasium is named gymnasium/MODULE:ID")
     task = env_task(name)
     arguments = {"task": task, **options} if task is not None else dict(options)
     require_arguments(f"env {name!r}", cls, arguments)

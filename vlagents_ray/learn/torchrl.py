@@ -202,7 +202,7 @@ class PolicyServer:
             file = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="vlr-torchrl-"))) / "factory"
             file.write_bytes(cloudpickle.dumps(self._factory))
             path = {"env_vars": {"PYTHONPATH": os.pathsep.join(filter(None, sys.path))}}  # of the factory's modules
-            args = {"batch": self._batch, "resources": self._resources, "environment": path}
+            args: dict[str, Any] = {"batch": self._batch, "resources": self._resources, "environment": path}
             plan = deployment(f"{__name__}:TorchRLPolicy", config={"factory": str(file)}, **args)
             stack.enter_context(running_server(plan, port=self.transport.port))
             self._publisher = Publisher(f"serve://{plan.applications[0].name}")

@@ -55,6 +55,8 @@ class TrainingEvaluation:
             ConfigError: The share or the plan is wrong, or there are results and `plan.resume` is off.
             UnknownEnv: There is no such env.
         """
+        if not isinstance(policy, str | Agent):
+            raise ConfigError(f"policy: got {type(policy).__name__}, want an Agent, or the URL of its server")
         if not 0 < share <= 1:
             raise ConfigError(f"share: got {share}, want a part of the trainer's time in (0, 1]")
         if len(plan.policies) != 1 or plan.policies[0].steps:

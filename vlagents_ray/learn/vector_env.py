@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Any, Literal
+from typing import Any, Literal, get_args
 
 import numpy as np
 
@@ -20,6 +20,7 @@ gymnasium: Any = require("gymnasium", extra=EXTRA)
 vector: Any = require("gymnasium.vector", extra=EXTRA)
 
 Observation = Literal["all", "state"]
+Autoreset = Literal["same_step", "next_step", "disabled"]
 _RESET_MASK = "reset_mask"  # Gymnasium's name of the option
 
 
@@ -79,7 +80,7 @@ def as_vector_env(
     num_envs: int = 1,
     *,
     observation: Observation = "all",
-    autoreset: Literal["same_step", "next_step", "disabled"] = "same_step",
+    autoreset: Autoreset = "same_step",
     env_options: Mapping[str, Any] | None = None,
     reset_options: Mapping[str, Any] | None = None,
 ) -> BatchVectorEnv:
@@ -108,6 +109,9 @@ def as_vector_env(
         MissingDependency: Gymnasium or the simulator is not installed.
         UnknownEnv: The name or the task is unknown.
     """
+    for name, got, known in (("observation", observation, Observation), ("autoreset", autoreset, Autoreset)):
+        if got not in get_args(known):
+            raise ConfigError(f"{name}: got {got!r}, want one of {list(get_args(known))}")
     batch = make_batch(env, num_envs, **(env_options or {}))
     try:
         return BatchVectorEnv(batch, observation, vector.AutoresetMode[autoreset.upper()], reset_options)
@@ -241,12 +245,9 @@ class BatchVectorEnv(vector.VectorEnv):  # type: ignore[misc]
             acts = [Act(row) if moves else None for row, moves in zip(rows, moving, strict=True)]
             seen, rewards, terminated, truncated, infos = self._batch.step(acts)
         self._steps += moving
+        outputs = [*zip(seen, rewards, terminated, truncated, infos, strict=True)]
         return [
-            (
-                i,
-                checked_step(seen[i], rewards[i], terminated[i], truncated[i], infos[i], self._contract, images=images),
-                dict(infos[i]),
-            )
+            (i, checked_step(*outputs[i], self._contract, images=images), dict(infos[i]))
             for i in np.flatnonzero(moving).tolist()
         ]
 
@@ -269,9 +270,8 @@ class BatchVectorEnv(vector.VectorEnv):  # type: ignore[misc]
             raise NotReset(f"reset: got a {_RESET_MASK} before the first reset; call reset(seed=...) for all first")
         numbers = range(self._begun, self._begun + len(chosen))
         seeds = stated or [self._seed + number for number in numbers]
-        options = [
-            options_of_reset(self._batch, number, {**self._reset_options, **(given or {})}) for number in numbers
-        ]
+        merged = {**self._reset_options, **(given or {})}
+        options = [options_of_reset(self._batch, number, merged) for number in numbers]
         with env_side("reset"):
             if which.all():
                 self._seen = [*self._batch.reset(seeds=seeds, options=options)]

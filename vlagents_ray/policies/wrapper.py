@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from vlagents_ray.contract import Contract
-from vlagents_ray.errors import ConfigError
+from vlagents_ray.errors import ConfigError, UnknownPolicy
 from vlagents_ray.interface import Act, Agent, Obs
 from vlagents_ray.policies.outcomes import of_good
 from vlagents_ray.registry import policy_class, wrapper_class
@@ -106,7 +106,9 @@ def build_agent(
     Wrappers are names, or {name: settings}; the first is the outermost one, which receives the robot's observations and
     is returned.
     """
-    agent: Agent = policy_class(policy).from_config(config)
+    if not issubclass(kind := policy_class(policy), Agent):
+        raise UnknownPolicy(f"policy {policy!r}: is no Agent; derive the class from vlagents_ray.Agent")
+    agent: Agent = kind.from_config(config)
     for entry in reversed(wrappers):
         named = {entry: {}} if isinstance(entry, str) else dict(entry)
         if len(named) != 1:

@@ -20,6 +20,8 @@ from vlagents_ray.naming import did_you_mean
 from vlagents_ray.registry import require
 from vlagents_ray.robot.check import Operator, arm_part
 
+if not os.environ.get("DISPLAY"):  # here, as packages of models import mujoco, which then reads it
+    os.environ.setdefault("MUJOCO_GL", "egl")
 _SETTLING_S = 1.0
 _GRIPPER = re.compile(r"gripper|finger|knuckle|jaw|fingers_actuator")
 _PREFIX = "vlagents_ray/"  # of what is added to a model, so that no name of the model is taken
@@ -120,8 +122,6 @@ class MujocoArm:
         speed: float = 1.5,
         clock: Any = time,
     ) -> None:
-        if not os.environ.get("DISPLAY"):
-            os.environ.setdefault("MUJOCO_GL", "egl")
         self._mujoco = mujoco = require("mujoco", extra="arms")
         stated = ARMS.get(like or str(model), ArmModel(str(model)))
         self.clock, self.delta, self.speed = clock, delta, speed

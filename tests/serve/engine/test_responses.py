@@ -15,7 +15,7 @@ from vlagents_ray.interface import Act, Obs
 from vlagents_ray.protocol.messages import Limits, Reply, Request
 from vlagents_ray.serve.config.deployment import LimitArgs
 from vlagents_ray.serve.engine import responses
-from vlagents_ray.serve.engine.responses import build_reply, raised_at, require_serializable
+from vlagents_ray.serve.engine.responses import build_reply, public_error, raised_at, require_serializable
 from vlagents_ray.serve.queue.call_limits import CallLimits
 from vlagents_ray.serve.requests import PendingRequest
 from vlagents_ray.serve.sessions import Session
@@ -89,6 +89,13 @@ def test_a_deployment_sets_the_limits_as_far_as_clients_read() -> None:
     assert LimitArgs(act_s=1, warm_up_s=2, load_s=3).call_limits() == CallLimits(1, 2, 3)
     with pytest.raises(ValueError, match="reply_bytes"):
         LimitArgs(reply_bytes=Limits().body_bytes + 1)
+
+
+def test_an_error_in_this_process_names_no_server() -> None:
+    pending = PendingRequest("s", Request("act", Obs()), lambda _: None)
+    assert str(public_error(RuntimeError("x"), pending)).endswith(
+        "the policy raised RuntimeError; the log has the traceback"
+    )
 
 
 @pytest.mark.parametrize("fail", [lambda: json.loads("{"), lambda: np.linalg.inv(np.zeros((2, 2)))])

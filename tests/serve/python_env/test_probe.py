@@ -177,3 +177,11 @@ def test_the_policy_is_built_where_it_will_run(tmp_path: Path, monkeypatch: pyte
     Path("deployment.yaml").write_text(yaml.safe_dump({"applications": [document]}))
     [app] = read_deployment("deployment.yaml").applications
     assert app.args["environment"]["python"] == str(python), "Ray is to see no relative path"
+
+
+def test_an_interpreter_that_does_not_answer_in_time_is_named_without_its_script(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr("vlagents_ray.serve.python_env.probe._TIMEOUT_S", 0.001)
+    with pytest.raises(ConfigError, match=r"runs here \(no answer in 0.001 s; is the machine busy\?\)$"):
+        probe(sys.executable)

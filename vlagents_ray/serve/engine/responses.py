@@ -80,9 +80,10 @@ def public_error(error: Exception, pending: PendingRequest) -> VLAgentsError:
     logger.error(
         "%s failed (session %s, request %s)", request.op, pending.session_id, request.request_id, exc_info=error
     )
+    named = f"server's log has the details under request id {request.request_id}"
     return PolicyFailed(
         f"{request.op}: the policy raised {type(error).__name__}{raised_at(error)}; "
-        f"the server's log has the details under request id {request.request_id or '(none)'}"
+        f"the {named if request.request_id else 'log has the traceback'}"
     )
 
 

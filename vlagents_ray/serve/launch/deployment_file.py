@@ -70,9 +70,10 @@ class Deployment(BaseModel, extra="allow"):
         return ServeDeploySchema.model_validate(self.model_dump(exclude_unset=True))
 
 
-def deployment(policy: str, **args: Any) -> Deployment:
-    """Return the deployment of one policy, as if read from a file; `args` are those of `ServerArgs`."""
-    return _of_name(policy, args)
+def deployment(policy: str, *, step_follows: bool = False, **args: Any) -> Deployment:
+    """Return the deployment of one policy, as if read from a file by `read_deployment`; `args` are of `ServerArgs`."""
+    app = {"name": policy.rpartition(":")[2], "route_prefix": "/", "import_path": IMPORT_PATH}
+    return _checked({"applications": [app | {"args": {"policy": policy, **args}}]}, f"policy {policy!r}", step_follows)
 
 
 def read_deployment(
@@ -92,11 +93,8 @@ def read_deployment(
     path = Path(source)
     if path.suffix in (".yaml", ".yml"):
         if not path.is_file():
-            where = "" if path.is_absolute() else f" in {Path.cwd()}"
-            meant = (
-                did_you_mean(source, map(str, path.parent.glob("*.y*ml"))) or "; a checkout has some in deployments/"
-            )
-            raise ConfigError(f"deployment file {source!r} does not exist{where}{meant}")
+            meant = did_you_mean(source, map(str, path.parent.glob("*.y*ml"))) or "; a checkout has deployments/"
+            raise ConfigError(f"deployment file {path.absolute()} does not exist{meant}")
         if overrides:
             raise ConfigError(f"{source!r} holds the settings; edit it instead of giving {sorted(overrides)}")
         try:
@@ -111,7 +109,7 @@ def read_deployment(
                 f"family, as in deployments/lerobot.yaml --set checkpoint={source}"
             )
         policy_class(source)  # raises an error with the list of choices
-    return _of_name(source, overrides or {}, step_follows)
+    return deployment(source, step_follows=step_follows, **(overrides or {}))
 
 
 def policy_application(source: str, app: str | None = None) -> Application:
@@ -220,12 +218,6 @@ def stated_contract(config: Deployment) -> Contract | None:
 def our_apps(config: Deployment) -> list[Application]:
     """Return the applications of a deployment that serve a policy."""
     return [app for app in config.applications if app.import_path == IMPORT_PATH]
-
-
-def _of_name(policy: str, args: Mapping[str, Any], step_follows: bool = False) -> Deployment:
-    name = policy.rpartition(":")[2]
-    app = {"name": name, "route_prefix": "/", "import_path": IMPORT_PATH, "args": {"policy": policy, **args}}
-    return _checked({"applications": [app]}, f"policy {policy!r}", step_follows)
 
 
 def _checked(document: object, source: str, step_follows: bool = False) -> Deployment:

@@ -87,9 +87,8 @@ def probe(
             env={**os.environ, **(env_vars or {})},
         )
     except (OSError, subprocess.TimeoutExpired) as error:
-        raise ConfigError(
-            f"environment.python: {python!r} is no Python interpreter that runs here ({error})"
-        ) from error
+        why = error if isinstance(error, OSError) else f"no answer in {_TIMEOUT_S} s; is the machine busy?"
+        raise ConfigError(f"environment.python: {python!r} is no Python interpreter that runs here ({why})") from error
     last = done.stdout.strip().rpartition("\n")[2]
     if not last.startswith("VLA{"):
         words = (done.stderr or done.stdout).strip()[-500:] or "it said nothing"
