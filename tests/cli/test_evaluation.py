@@ -194,7 +194,7 @@ def test_each_option_that_is_a_setting_is_one_of_a_single_model() -> None:
         for option in inspect.signature(command.evaluate_command).parameters
     }
     of_the_run_itself = {
-        "what", "watch", "until", "settle", "marker", "dry_run", "end_at", "replica_per_gpu", "address", "live",
+        "what", "watch", "until", "settle_s", "marker", "dry_run", "end_at", "replica_per_gpu", "address", "live",
         "live_at", "arm", "operator", "unblind",
     }  # fmt: skip
     assert {option for option, found in places.items() if len(found) != 1} == of_the_run_itself
