@@ -77,7 +77,7 @@ def test_two_drivers_on_one_cluster_play_a_part_each_and_their_results_are_merge
             assert [driver.wait(300) for driver in drivers] == [0, 0]
     merge = [sys.executable, "-c", "from vlagents_ray.cli import main; main()", "merge"]
     done = subprocess.run(
-        [*merge, str(tmp_path / "all"), *map(str, parts)], capture_output=True, text=True, check=False
+        [*merge, *map(str, parts), "--out", str(tmp_path / "all")], capture_output=True, text=True, check=False
     )
     assert done.returncode == 0, done.stdout + done.stderr
     merged = Results.load(tmp_path / "all")

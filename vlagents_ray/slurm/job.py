@@ -179,7 +179,7 @@ def run_command(arguments: Sequence[str]) -> None:
         words += ["--resume", "--replica-per-gpu"]
         if given.fill is not None:
             words += [f"--workers={max(1, int((cpus - 1) / given.fill))}", f"--worker-cpus={given.fill:g}"]
-        words += [] if end is None else [f"--end-at={end - given.closing:.0f}"]
+        words += [] if end is None else [f"--end-at={end - given.closing_s:.0f}"]
     else:
         from vlagents_ray.serve.access.key_store import new_key
 
