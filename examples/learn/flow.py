@@ -125,9 +125,11 @@ class FlowLearner:
         stated = torch.from_numpy(columns["logprob"].reshape(-1, EXECUTE).copy())
         gain, targets = self._advantages(columns, contexts)
         rows, clipped, first = np.flatnonzero(gain.any(1)), list[float](), 0.0
+        if not len(rows):
+            return Learned(0, 0.0, 0.0)
         for _ in range(self._epochs):
             order = self._rng.permutation(rows)
-            for number in np.array_split(order, max(1, round(len(order) / BATCH))) if len(rows) else ():
+            for number in np.array_split(order, max(1, round(len(order) / BATCH))):
                 batch = torch.from_numpy(number)
                 logprob = self._logprob(contexts[batch], chains[batch])
                 first = first or log_ratio(logprob.detach(), stated[batch]).std
@@ -141,7 +143,7 @@ class FlowLearner:
                 torch.nn.utils.clip_grad_norm_(self._trained.values(), 1.0)
                 self._optimizer.step()
                 self.steps += 1
-        return Learned(len(rows), float(np.mean(clipped or [0.0])), first)
+        return Learned(len(rows), float(np.mean(clipped)), first)
 
     def _advantages(
         self, columns: Mapping[str, np.ndarray], contexts: torch.Tensor
@@ -213,7 +215,8 @@ class FlowRun:
                 solved = np.logical_or.reduceat(columns["success"], episodes(columns)[0]).mean()
                 played = time.monotonic()
                 learned = learner.improve(columns)
-                rollouts.version = weights.push(learner.state(), partial=True, version=learner.steps)
+                if learned.acts:
+                    rollouts.version = weights.push(learner.state(), partial=True, version=learner.steps)
                 print(
                     f"iteration {iteration + 1}: {solved:.1%} of {plan.episodes} episodes solved, {played - begun:.1f} "
                     f"s; {learned.acts} acts, {learned.clipped:.0%} clipped, log ratio {learned.log_ratio:.1g}, "

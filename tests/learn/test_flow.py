@@ -71,6 +71,16 @@ def test_a_run_trains_the_flow_alone_and_writes_results_and_a_checkpoint(
     assert "gain: " in said
 
 
+def test_an_iteration_whose_groups_all_fail_teaches_nothing_and_the_run_goes_on(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(flow, "TICKS", 4)  # too few to solve anything
+    run = FlowRun(plan("grpo", tmp_path / "run", iterations=2, episodes=8))
+    run.learn()
+    assert run._learner.steps == 0
+    assert "iteration 2: 0.0% of 8 episodes solved" in capsys.readouterr().out
+
+
 def test_a_learners_step_makes_good_acts_likelier(tmp_path: Path) -> None:
     run = FlowRun(plan("grpo", tmp_path / "run"))
     with run._policy() as (_, acting), run._rollouts(acting) as rollouts:
