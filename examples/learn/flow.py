@@ -109,7 +109,7 @@ class FlowLearner:
         flow, value = list(self._trained.values()), list(self._value.parameters())
         groups = [{"params": flow, "lr": RATE}, {"params": value, "lr": VALUE_RATE}]
         self._optimizer = torch.optim.AdamW(groups, betas=(0.9, 0.99), weight_decay=0.0)
-        self.steps = 0  # of the optimizer
+        self.version = 0  # of the weights: how often it learned
 
     def state(self) -> dict[str, torch.Tensor]:
         """Return the trained values by name, for a partial push."""
@@ -142,7 +142,7 @@ class FlowLearner:
                 loss.backward()
                 torch.nn.utils.clip_grad_norm_(self._trained.values(), 1.0)
                 self._optimizer.step()
-                self.steps += 1
+        self.version += 1
         return Learned(len(rows), float(np.mean(clipped)), first)
 
     def _advantages(
@@ -216,7 +216,7 @@ class FlowRun:
                 played = time.monotonic()
                 learned = learner.improve(columns)
                 if learned.acts:
-                    rollouts.version = weights.push(learner.state(), partial=True, version=learner.steps)
+                    rollouts.version = weights.push(learner.state(), partial=True, version=learner.version)
                 print(
                     f"iteration {iteration + 1}: {solved:.1%} of {plan.episodes} episodes solved, {played - begun:.1f} "
                     f"s; {learned.acts} acts, {learned.clipped:.0%} clipped, log ratio {learned.log_ratio:.1g}, "
@@ -240,7 +240,7 @@ class FlowRun:
 
     def _play(self, evaluation: TrainingEvaluation) -> None:
         self._evaluated.load_parameters(self._evaluated.parameters() | self._learner.state())
-        newest = evaluation.play(self._learner.steps).totals[-1]
+        newest = evaluation.play(self._learner.version).totals[-1]
         print(f"{newest.contender}: {newest.success_once.rate:.1%} of {self._plan.held_out} held-out episodes solved")
 
     @contextlib.contextmanager
@@ -287,15 +287,17 @@ def learn(
     iterations: Annotated[int, typer.Option(min=1)] = 20,
     episodes: Annotated[int, typer.Option(min=1, help="Of an iteration.")] = 512,
     held_out: Annotated[int, typer.Option(min=1, help="Episodes of an evaluation.")] = 500,
+    evaluate_every: Annotated[int, typer.Option(min=1, help="Iterations.")] = 5,
     max_lag: Annotated[
         int | None, typer.Option(min=0, help="Play while learning, with weights at most so many versions old.")
     ] = None,
 ) -> None:
     """Improve the reference policy from pixels, by the reward of the environment alone."""
     torch.set_num_threads(1)  # its networks are small
-    settings = {"seed": seed, "iterations": iterations, "episodes": episodes, "held_out": held_out, "max_lag": max_lag}
+    settings = {"iterations": iterations, "episodes": episodes, "held_out": held_out, "evaluate_every": evaluate_every}
+    run = {"method": method, "out": out, "seed": seed, "max_lag": max_lag}
     with errors():
-        FlowRun(FlowPlan.model_validate(settings | {"method": method, "out": out})).learn()
+        FlowRun(FlowPlan.model_validate(settings | run)).learn()
 
 
 @app.command("compare")

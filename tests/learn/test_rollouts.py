@@ -4,12 +4,13 @@ import itertools
 import os
 import subprocess
 import sys
+import threading
 from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
 import pytest
-from eval_fakes import EVERY, LINE, OTHER_LINE, Line, SevenLine, ToZero
+from eval_fakes import EVERY, LINE, OTHER_LINE, Line, SevenLine, ToZero, wait_for
 from in_process_evaluation import flat_config
 from in_process_replicas import Replicas
 
@@ -112,6 +113,7 @@ def test_collect_plays_so_many_and_no_others(pool: type[Workers]) -> None:
 
 PLAY = """
 import sys
+import threading
 for name in ("ray", "torch"):
     sys.modules[name] = None  # as if it were not installed
 from eval_fakes import LINE, ToZero
@@ -328,3 +330,29 @@ def test_an_env_that_nobody_knows_is_an_error_at_once() -> None:
         Rollouts(RolloutPlan("nowhere", ToZero))
     with pytest.raises(ValueError, match="wrkers"):
         Rollouts(RolloutPlan(LINE, ToZero, settings={"wrkers": 3}))
+
+
+def test_workers_play_on_while_the_learner_learns_and_no_further_than_allowed(pool: type[Workers]) -> None:
+    with Rollouts(RolloutPlan(LINE, ToZero, workers=2)) as found:
+        next(found)
+        wait_for(lambda: len(pool.played) == 5)  # without a further call: two for each of the two
+        table = found.collect(2)
+        assert list(dict.fromkeys(arrays(table)["key"])) == planned(3)[1:]
+        assert sorted(pool.played) == sorted(planned(5))
+    assert not [thread for thread in threading.enumerate() if thread.name == "rollouts"]
+
+
+def test_an_error_while_the_learner_learns_is_raised_by_its_next_calls(monkeypatch: pytest.MonkeyPatch) -> None:
+    class Breaks(ToZero):
+        broken = False
+
+        def act(self, obs: Obs) -> Act:
+            return Act(np.full(1, np.nan, np.float32)) if type(self).broken else super().act(obs)
+
+    with Rollouts(RolloutPlan(LINE, Breaks, settings={"abort_after": 1})) as found:
+        first = next(found)
+        monkeypatch.setattr(Breaks, "broken", True)
+        with pytest.raises(PolicyFailed, match="1 episodes in a row"):
+            list(itertools.islice(found, 5))
+        monkeypatch.setattr(Breaks, "broken", False)
+        assert next(found).num_rows == first.num_rows, "it goes on"

@@ -7,6 +7,7 @@ import itertools
 import math
 import os
 import sys
+import threading
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, field
@@ -290,6 +291,10 @@ class Rollouts:
         self._attempts = FailedAttempts(config)
         self._resources = ExitStack()
         self._pool: Workers | None = None
+        self._state = threading.Condition()  # guards all of the above but a wait for reports
+        self._player: threading.Thread | None = None  # plays on while the learner learns
+        self._stopping = False
+        self._error: BaseException | None = None  # which ended the player
         self._version = self._pushed = 0
         self.stats = RolloutStats()  # the numbers of episodes so far
 
@@ -315,11 +320,14 @@ class Rollouts:
         return self
 
     def __next__(self) -> Any:
-        """Return the transitions of the next episode, a `pyarrow.RecordBatch`; workers continue with later ones."""
+        """Return the transitions of the next episode, a `pyarrow.RecordBatch`.
+
+        A thread hands later episodes to the workers meanwhile, also until the next call: two for each environment.
+        """
         delivered: list[Any] = []
         while not delivered:
-            start = self._position // self._block * self._block
-            delivered = self._deliver(self._position + 1, start + self._ahead)
+            end = self._position + 1
+            delivered = self._deliver(end, end // self._block * self._block + self._ahead)
         return delivered[0]
 
     def collect(self, episodes: int) -> Any:
@@ -354,6 +362,7 @@ class Rollouts:
         Delivered transitions are in Ray's memory: copy those that are needed after the end of Ray. A later request
         starts workers again, which repeat the episodes that were not delivered.
         """
+        self._stop_player()
         if self._pool is not None:
             self._pool.close()
         self._end(None, None, None)
@@ -368,6 +377,7 @@ class Rollouts:
             self._end(*exc)
 
     def _end(self, *exc: Any) -> None:
+        self._stop_player()
         for episode in self._episodes.values():
             episode.over, episode.transitions = False, None  # they are in the memory of a Ray that may end
         self._pool = None
@@ -375,19 +385,64 @@ class Rollouts:
 
     def _deliver(self, end: int, limit: int) -> list[Any]:
         """Play until the episodes before number `end` are over; those before number `limit` may also begin."""
-        self._plan(max(end, limit))
-        wanted = list(itertools.islice(self._episodes.items(), end - self._position))
-        self._replay_stale()
-        while not all(episode.over for _, episode in wanted):
-            self._play_on()
-            self._replay_stale()
-        for key, _ in wanted:
-            del self._episodes[key]
-        self._position = end
+        try:
+            if ahead := limit > end and self._settings.workers > 0:
+                self._start_player()
+            else:
+                self._stop_player()
+            with self._state:
+                self._plan(max(end, limit))
+                wanted = list(itertools.islice(self._episodes.items(), end - self._position))
+                self._replay_stale()
+                self._state.notify_all()
+                while not all(episode.over for _, episode in wanted):
+                    if self._error is not None:
+                        raise self._error
+                    if ahead:
+                        self._state.wait()
+                    else:
+                        self._play_on()
+                for key, _ in wanted:
+                    del self._episodes[key]
+                self._position = end
+        except BaseException:
+            self._end(*sys.exc_info())
+            raise
         batches = [episode.transitions for _, episode in wanted if episode.transitions is not None]
         self.stats.episodes += len(batches)
         self.stats.transitions += sum(batch.num_rows for batch in batches)
         return batches
+
+    def _start_player(self) -> None:
+        if self._player is None:
+            self._stopping, self._error = False, None
+            self._running_pool()  # on this thread, as Ray may be started for it, with handlers of signals
+            self._player = threading.Thread(target=self._play_ahead, name="rollouts", daemon=True)
+            self._player.start()
+
+    def _stop_player(self) -> None:
+        if self._player is not None:
+            with self._state:
+                self._stopping = True
+                self._state.notify_all()
+            self._player.join()
+            self._player = None
+
+    def _play_ahead(self) -> None:
+        """Play what is planned until `_stopping`, or until an error."""
+        pool = self._running_pool()
+        try:
+            while True:
+                with self._state:
+                    while not (self._stopping or len(self._queue) or pool.busy):
+                        self._state.wait()
+                    if self._stopping:
+                        return
+                self._play_on()
+        except BaseException as error:  # the next call raises it
+            with self._state:
+                self._error = error
+                self._state.notify_all()
 
     def _plan(self, limit: int) -> None:
         """Queue the episodes up to number `limit`."""
@@ -403,18 +458,22 @@ class Rollouts:
         self._planned = max(self._planned, limit)
 
     def _play_on(self) -> None:
-        """Hand out jobs, and take the reports that arrive; any error ends the workers."""
-        try:
-            if self._pool is None:
-                pool_of = workers_class(self._config, self._resources)
-                self._pool = self._resources.enter_context(pool_of(self._config, self._factory, self._recorders))
-                self._queue = JobQueue(episode.job for episode in self._episodes.values())
-            dispatch(self._pool, self._queue, self._begin)
-            for job, report in self._pool.wait(POLL_S):
+        """Hand out jobs, and take the reports that arrive."""
+        pool = self._running_pool()
+        with self._state:
+            dispatch(pool, self._queue, self._begin)
+        for job, report in pool.wait(POLL_S):
+            with self._state:
                 self._handle(job, report)
-        except BaseException:
-            self._end(*sys.exc_info())
-            raise
+                self._replay_stale()
+                self._state.notify_all()
+
+    def _running_pool(self) -> Workers:
+        if self._pool is None:
+            pool_of = workers_class(self._config, self._resources)
+            self._pool = self._resources.enter_context(pool_of(self._config, self._factory, self._recorders))
+            self._queue = JobQueue(episode.job for episode in self._episodes.values())
+        return self._pool
 
     def _begin(self, jobs: tuple[Job, ...]) -> None:
         for job in jobs:
