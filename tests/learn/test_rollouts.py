@@ -342,6 +342,24 @@ def test_workers_play_on_while_the_learner_learns_and_no_further_than_allowed(po
     assert not [thread for thread in threading.enumerate() if thread.name == "rollouts"]
 
 
+@pytest.mark.parametrize("lag", [0, 1, 4])
+@pytest.mark.parametrize("step", [1, 8])
+def test_at_a_steady_pace_no_episode_is_played_twice(
+    pool: type[Workers], versioned: type[Versioned], lag: int, step: int
+) -> None:
+    with Rollouts(RolloutPlan(LINE, versioned, workers=2, max_lag=lag)) as found:
+        for number in range(8):
+            lags = [found.version - next(found).column("version")[0].as_py() for _ in range(2)]
+            stale = found.stats.stale
+            if number > 3:
+                assert stale == before, "the pace is known"
+                assert max(lags) == (min(lag, 2) if step == 1 else 0)
+            before = stale
+            wait_for(lambda: found._player is None or not (found._queue or found._pool.busy))  # type: ignore[union-attr]
+            versioned.version = found.version = versioned.version + step
+    assert len(pool.played) == len(set(pool.played)) + found.stats.stale
+
+
 def test_an_error_while_the_learner_learns_is_raised_by_its_next_calls(monkeypatch: pytest.MonkeyPatch) -> None:
     class Breaks(ToZero):
         broken = False

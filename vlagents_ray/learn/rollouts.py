@@ -199,7 +199,9 @@ class _PlannedEpisode:
     """An episode that is planned and not yet delivered."""
 
     job: Job  # its first attempt
+    number: int
     over: bool = False
+    held: bool = False  # to be played again, but not yet
     transitions: Any = None  # if it is over; None if it is lost
     oldest: int = 0  # oldest version of the weights among its actions
     pushed: int = 0  # the learner's version when the last attempt began
@@ -296,6 +298,9 @@ class Rollouts:
         self._stopping = False
         self._error: BaseException | None = None  # which ended the player
         self._version = self._pushed = 0
+        self._allowed = plan.first  # number of the first episode that is not to begin yet
+        self._since = plan.first  # the position when the version changed
+        self._pace = 0, 0  # episodes delivered between the last two changes, and their distance in versions
         self.stats = RolloutStats()  # the numbers of episodes so far
 
     @property
@@ -309,7 +314,9 @@ class Rollouts:
 
     @version.setter
     def version(self, pushed: int) -> None:
-        self._pushed, self._version = pushed, max(self._version, pushed)
+        with self._state:
+            self._pushed = pushed
+            self._saw(pushed)
 
     @property
     def position(self) -> int:
@@ -326,8 +333,7 @@ class Rollouts:
         """
         delivered: list[Any] = []
         while not delivered:
-            end = self._position + 1
-            delivered = self._deliver(end, end // self._block * self._block + self._ahead)
+            delivered = self._deliver(self._position + 1, self._limit())
         return delivered[0]
 
     def collect(self, episodes: int) -> Any:
@@ -379,9 +385,34 @@ class Rollouts:
     def _end(self, *exc: Any) -> None:
         self._stop_player()
         for episode in self._episodes.values():
-            episode.over, episode.transitions = False, None  # they are in the memory of a Ray that may end
+            episode.over, episode.held, episode.transitions = (
+                False,
+                False,
+                None,
+            )  # they are in the memory of a Ray that may end
         self._pool = None
         self._resources.__exit__(*exc)
+
+    def _limit(self) -> int:
+        """Return the number of the first episode that is not to begin yet.
+
+        At the pace of the last push, an episode with a higher number would be too old when it is its turn. Without this
+        limit, learners that once were slow would for ever get episodes that are played twice.
+        """
+        after = self._position + 1
+        limit = after // self._block * self._block + self._ahead
+        episodes, versions = self._pace
+        if self._settings.max_lag is None or self._position >= self._since + episodes:  # slower than at the last push
+            return limit
+        usable = self._since + episodes * (1 + self._settings.max_lag // versions)
+        return max(after, min(limit, math.ceil(usable / self._block) * self._block))
+
+    def _saw(self, version: int) -> None:
+        """Note the version of an act or of a push."""
+        if version > self._version:
+            if delivered := self._position - self._since:
+                self._pace, self._since = (delivered, version - self._version), self._position
+            self._version = version
 
     def _deliver(self, end: int, limit: int) -> list[Any]:
         """Play until the episodes before number `end` are over; those before number `limit` may also begin."""
@@ -453,9 +484,9 @@ class Rollouts:
             # The first of a group is the episode of an evaluation; the others have policy seeds above its own.
             policy_seed = self._settings.seed + number if member else None
             job = Job(EpisodeKey(cell.env, episode, self._settings.seed + episode, cell.fingerprint, policy_seed), cell)
-            self._episodes[job.key] = _PlannedEpisode(job)
+            self._episodes[job.key] = _PlannedEpisode(job, number)
             self._queue.put(job)
-        self._planned = max(self._planned, limit)
+        self._planned, self._allowed = max(self._planned, limit), limit
 
     def _play_on(self) -> None:
         """Hand out jobs, and take the reports that arrive."""
@@ -495,7 +526,8 @@ class Rollouts:
             return
         self._attempts.note_played()
         versions = transitions.column("version").to_numpy()
-        episode.oldest, self._version = int(versions.min()), max(self._version, int(versions.max()))
+        episode.oldest = int(versions.min())
+        self._saw(int(versions.max()))
         most = self._settings.max_lag
         if most is not None and episode.pushed - episode.oldest > most:  # it would always be too old
             raise WeightsLost(
@@ -505,10 +537,12 @@ class Rollouts:
             )
 
     def _replay_stale(self) -> None:
-        """Queue episodes again whose acts have outdated weights."""
-        for episode in self._episodes.values():
+        """Queue episodes again whose acts have outdated weights, in their order, or hold those that are not to begin."""
+        for episode in reversed(self._episodes.values()):
             lag = self._version - episode.oldest if episode.transitions is not None else 0
             if self._settings.max_lag is not None and lag > self._settings.max_lag:
-                episode.over, episode.transitions = False, None
+                episode.over, episode.held, episode.transitions = False, True, None
                 self.stats.stale += 1
+            if episode.held and episode.number < self._allowed:
+                episode.held = False
                 self._queue.put_back(episode.job)
