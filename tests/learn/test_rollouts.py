@@ -347,6 +347,7 @@ def test_workers_play_on_while_the_learner_learns_and_no_further_than_allowed(po
 def test_at_a_steady_pace_no_episode_is_played_twice(
     pool: type[Workers], versioned: type[Versioned], lag: int, step: int
 ) -> None:
+    before = 0
     with Rollouts(RolloutPlan(LINE, versioned, workers=2, max_lag=lag)) as found:
         for number in range(8):
             lags = [found.version - next(found).column("version")[0].as_py() for _ in range(2)]

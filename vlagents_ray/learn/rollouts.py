@@ -470,7 +470,7 @@ class Rollouts:
                     if self._stopping:
                         return
                 self._play_on()
-        except BaseException as error:  # the next call raises it
+        except BaseException as error:  # noqa: BLE001 - the next call raises it
             with self._state:
                 self._error = error
                 self._state.notify_all()
@@ -537,7 +537,7 @@ class Rollouts:
             )
 
     def _replay_stale(self) -> None:
-        """Queue episodes again whose acts have outdated weights, in their order, or hold those that are not to begin."""
+        """Queue episodes again whose acts have outdated weights, or hold them until they may begin."""
         for episode in reversed(self._episodes.values()):
             lag = self._version - episode.oldest if episode.transitions is not None else 0
             if self._settings.max_lag is not None and lag > self._settings.max_lag:
