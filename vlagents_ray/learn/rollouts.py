@@ -356,7 +356,7 @@ class Rollouts:
         batches: list[Any] = []
         while not batches:
             end = self._position + episodes
-            batches = self._deliver(end, end)
+            batches = self._deliver(end)
         try:
             return self._pa.Table.from_batches(batches)
         except (self._pa.ArrowInvalid, ValueError) as error:
@@ -385,12 +385,9 @@ class Rollouts:
     def _end(self, *exc: Any) -> None:
         self._stop_player()
         for episode in self._episodes.values():
-            episode.over, episode.held, episode.transitions = (
-                False,
-                False,
-                None,
-            )  # they are in the memory of a Ray that may end
-        self._pool = None
+            episode.over = episode.held = False
+            episode.transitions = None  # in the memory of a Ray that may end
+        self._pool = self._error = None
         self._resources.__exit__(*exc)
 
     def _limit(self) -> int:
@@ -404,8 +401,7 @@ class Rollouts:
         episodes, versions = self._pace
         if self._settings.max_lag is None or self._position >= self._since + episodes:  # slower than at the last push
             return limit
-        usable = self._since + episodes * (1 + self._settings.max_lag // versions)
-        return max(after, min(limit, math.ceil(usable / self._block) * self._block))
+        return min(limit, self._since + episodes * (1 + self._settings.max_lag // versions))
 
     def _saw(self, version: int) -> None:
         """Note the version of an act or of a push."""
@@ -414,15 +410,15 @@ class Rollouts:
                 self._pace, self._since = (delivered, version - self._version), self._position
             self._version = version
 
-    def _deliver(self, end: int, limit: int) -> list[Any]:
-        """Play until the episodes before number `end` are over; those before number `limit` may also begin."""
+    def _deliver(self, end: int, limit: int | None = None) -> list[Any]:
+        """Play until the episodes before number `end` are over; those before `limit` may also begin, and go on."""
         try:
-            if ahead := limit > end and self._settings.workers > 0:
+            if ahead := limit is not None and self._settings.workers > 0:
                 self._start_player()
             else:
                 self._stop_player()
             with self._state:
-                self._plan(max(end, limit))
+                self._plan(limit or end)
                 wanted = list(itertools.islice(self._episodes.items(), end - self._position))
                 self._replay_stale()
                 self._state.notify_all()
@@ -446,7 +442,7 @@ class Rollouts:
 
     def _start_player(self) -> None:
         if self._player is None:
-            self._stopping, self._error = False, None
+            self._stopping = False
             self._running_pool()  # on this thread, as Ray may be started for it, with handlers of signals
             self._player = threading.Thread(target=self._play_ahead, name="rollouts", daemon=True)
             self._player.start()
