@@ -201,7 +201,7 @@ class _PlannedEpisode:
     job: Job  # its first attempt
     number: int
     over: bool = False
-    held: bool = False  # to be played again, but not yet
+    held: bool = False  # it was too old, and waits until it may begin again
     transitions: Any = None  # if it is over; None if it is lost
     oldest: int = 0  # oldest version of the weights among its actions
     pushed: int = 0  # the learner's version when the last attempt began
@@ -293,7 +293,7 @@ class Rollouts:
         self._attempts = FailedAttempts(config)
         self._resources = ExitStack()
         self._pool: Workers | None = None
-        self._state = threading.Condition()  # guards all of the above but a wait for reports
+        self._state = threading.Condition()  # held by whoever plays or asks, but not during a wait for reports
         self._player: threading.Thread | None = None  # plays on while the learner learns
         self._stopping = False
         self._error: BaseException | None = None  # which ended the player
