@@ -130,13 +130,25 @@ def test_a_gpu_test_may_be_skipped_and_an_expected_failure_is_no_skip(skipping: 
 
 SCRIPT = Path(__file__).parent / "support" / "play_again.py"
 TESTS = """
+import pytest
 from pathlib import Path
 
-def test_by_chance():
-    seen = Path('seen')
+def fail_once(name):
+    seen = Path(name)
     if not seen.exists():
         seen.touch()
         raise AssertionError('the first time')
+
+def test_by_chance():
+    fail_once('seen')
+
+@pytest.fixture(scope='module')
+def late_server():
+    fail_once('started')
+
+@pytest.mark.parametrize('number', range(20))
+def test_that_needs_a_server(late_server, number):
+    pass
 
 def test_broken():
     assert not Path('broken').exists()
@@ -163,6 +175,7 @@ def test_only_what_passes_the_second_time_on_ci_is_flaky(tmp_path: Path, ci: str
         (tmp_path / "broken").touch()
     got, output = run(tmp_path, ci)
     assert got == status
-    assert ("flaky: test_some.py::test_by_chance" in output) == (ci == "true")
+    for one in ("test_by_chance", "test_that_needs_a_server[19]"):
+        assert (f"flaky: test_some.py::{one}" in output) == (ci == "true")
     assert "flaky: test_some.py::test_broken" not in output
     assert (tmp_path / "times").read_text() == "once "

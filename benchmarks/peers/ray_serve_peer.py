@@ -64,10 +64,15 @@ def connect(target: peer.Target) -> peer.Client:
     """Make a client of the mode, once the replica answers."""
     url = f"http://{target.host}:{target.port}/"
     deadline = time.monotonic() + _START_S
-    while (answer := requests.get(url, timeout=_START_S)).status_code != requests.codes.ok:
-        if time.monotonic() > deadline:
-            raise TimeoutError(f"{url}: {answer.status_code}")
-        time.sleep(0.2)
+    while True:
+        try:
+            answer = requests.get(url, timeout=_START_S)
+            answer.raise_for_status()
+            break
+        except requests.RequestException:  # its proxy resets connections while it learns of the replica
+            if time.monotonic() > deadline:
+                raise
+            time.sleep(0.2)
     obs = target.cameras | {"state": target.state}
     if target.mode == "handle":
         ray.init(address=answer.text, ignore_reinit_error=True)

@@ -5,12 +5,12 @@ from __future__ import annotations
 import gc
 import itertools
 import os
-from collections.abc import Iterator
 from contextlib import suppress
 
 import numpy as np
 import psutil
 import pytest
+import shared_ray
 from eval_fakes import wait_for
 from process_resources import unpooled_threads
 
@@ -29,14 +29,15 @@ ROUNDS = 4
 MOST = {"descriptors": 2, "threads": 2, "maps": 1, "own descriptors": 2, "own threads": 2}  # that may be left
 
 
-@pytest.fixture(scope="module")
-def server(shared_ray: None) -> Iterator[Server]:
+@pytest.mark.own_process
+def test_sessions_opened_and_closed_leave_nothing() -> None:
+    shared_ray.start()
     with serving("served_agents:Accountant") as server:
-        yield server
+        for transport in SESSIONS:
+            open_and_close(server, transport)
 
 
-@pytest.mark.parametrize("transport", SESSIONS)
-def test_sessions_opened_and_closed_leave_nothing(server: Server, transport: TransportName) -> None:
+def open_and_close(server: Server, transport: TransportName) -> None:
     frame = Obs({"front": np.zeros((64, 64, 3), np.uint8)})
     where = f"serve://{next(iter(server.apps))}" if transport in ("handle", "plasma") else server.url
 
