@@ -61,7 +61,7 @@ def test_maniskill_is_solved_whatever_the_number_of_workers(ray_home: Path, tmp_
 
 def test_kill_dash_nine_and_resume_leave_each_episode_once(ray_home: Path, tmp_path: Path) -> None:
     out = tmp_path / "out"
-    words = ["tabletop", "--policy", "scripted", "--episodes", "200", "--workers", "2", "--video", "none"]
+    words = ["tabletop", "--policy", "scripted", "--episodes", "60", "--workers", "2", "--video", "none"]
     words += ["--out", str(out)]
     with subprocess.Popen(
         [COMMAND, "eval", *words], env=os.environ | {"RAY_TMPDIR": str(ray_home)},
@@ -72,20 +72,20 @@ def test_kill_dash_nine_and_resume_leave_each_episode_once(ray_home: Path, tmp_p
     wait_for_end(ray_home, "Rollout", "bin/haproxy")
     end(ray_home)
     before = rows(out)
-    assert 5 <= len(before) < 200
+    assert 5 <= len(before) < 60
     refused = evaluate(ray_home, *words)
     assert refused.returncode == 2
     assert "--resume" in refused.stderr
     done = evaluate(ray_home, *words, "--resume")
     assert done.returncode == 0, done.stderr
     after = rows(out)
-    assert [row[1] for row in after] == list(range(200))
+    assert [row[1] for row in after] == list(range(60))
     assert set(before) <= set(after)
 
 
 def test_results_without_workers_are_those_with_them_and_each_resumes_the_other(ray_home: Path, tmp_path: Path) -> None:
     words = ["tabletop", "tabletop/stack", "--policy", "scripted", "--video", "none", "--out"]
-    orders = {"whole": ["0"], "workers": ["2"], "there": ["0", "2"], "back": ["2", "0"]}
+    orders = {"whole": ["0"], "there": ["0", "2"], "back": ["2", "0"]}
     for name, order in orders.items():
         for number, workers in enumerate(order):
             episodes = "4" if number == len(order) - 1 else "2"

@@ -91,6 +91,7 @@ def test_served_flights_are_those_in_process_to_the_bit(server: Server) -> None:
     np.testing.assert_array_equal(served, fly(range(FLIGHTS), together(loaded(), FLIGHTS), STEPS))
 
 
+@pytest.mark.integration
 @pytest.mark.parametrize("transport", TRANSPORTS)
 def test_a_killed_replica_costs_no_flight(server: Server, transport: TransportName) -> None:
     """The client says that the session began again, and it acts as the reference does."""
@@ -118,6 +119,7 @@ def test_a_killed_replica_is_an_error_where_sessions_are_not_resumed(server: Ser
             agent.act(START)
 
 
+@pytest.mark.integration
 def test_flights_go_on_to_the_bit_while_a_replica_stops(server: Server) -> None:
     scale(2)
     agents = [client(server, transport) for transport in TRANSPORTS for _ in range(2)]

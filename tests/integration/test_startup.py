@@ -145,6 +145,7 @@ def test_a_taken_port_is_said_at_once() -> None:
     assert "choose another --port" in result.stderr
 
 
+@pytest.mark.integration
 def test_serve_deploy_takes_the_same_file(tmp_path: Path) -> None:
     """Ray's own tools, on a cluster that Ray's own tools started."""
     serve_port, dashboard, gcs, robots = free_port(), free_port(), free_port(), free_port()

@@ -39,7 +39,7 @@ def start() -> None:
     _port = free_port()
     with contextlib.ExitStack() as stack:
         patch = stack.enter_context(pytest.MonkeyPatch.context())
-        patch.setenv("RAY_metrics_report_interval_ms", "500")  # instead of 10 s, for which tests would wait
+        patch.setenv("RAY_metrics_report_interval_ms", "2000")  # instead of 10 s, for which tests would wait
         patch.setenv("PYTHONPATH", os.pathsep.join(map(str, _POLICIES)), prepend=os.pathsep)
         stack.enter_context(own_ray(LOOPBACK, _port, num_cpus=_CPUS))
         _running = stack.pop_all()
