@@ -72,9 +72,9 @@ def test_modules_of_ones_own_are_served_evaluated_and_trained_from_their_folder(
     assert [line for line in said.splitlines() if not line.startswith("log of Ray, ")] == [
         f"serving Servo at {url}",
         "  policy: own_policy:Servo (camera_turn=120)",
-        f"  how to talk to it: {url}/docs",
-        f"  what it does now: {url}/live",
-        f"Ray programs of yours on this machine: vlagents_ray.join('{url}')",
+        f"  API: {url}/docs",
+        f"  live page: {url}/live",
+        f"in a Ray program on this machine: vlagents_ray.join('{url}')",
         "Ctrl-C stops",
     ]
     [kept] = re.findall(r"^log of Ray, Serve and HAProxy: (.*)$", said, re.MULTILINE)

@@ -151,8 +151,8 @@ def test_a_server_says_its_policy_its_page_and_where_each_kind_of_client_connect
     assert said[1].startswith("  from other machines: https://")
     assert said[2:] == [
         "  policy: noop (action_dim=7)",
-        "  how to talk to it: https://127.0.0.1:8000/docs",
-        "  what it does now: https://127.0.0.1:8000/live",
+        "  API: https://127.0.0.1:8000/docs",
+        "  live page: https://127.0.0.1:8000/live",
         "  openpi: wss://127.0.0.1:8000/, wss://127.0.0.1:8000/openpi",
         "  gr00t: tcp://0.0.0.0:5556",
         "  vlagents: rpyc://0.0.0.0:8080",
@@ -161,7 +161,7 @@ def test_a_server_says_its_policy_its_page_and_where_each_kind_of_client_connect
 
 def test_the_page_of_a_server_with_keys_is_asked_for_with_one(tmp_path: Path) -> None:
     urls = {"noop": "http://127.0.0.1:8000"}
-    page = '  how to talk to it: curl -H "Authorization: Bearer $VLAGENTS_RAY_API_KEY" http://127.0.0.1:8000/docs'
+    page = '  API: curl -H "Authorization: Bearer $VLAGENTS_RAY_API_KEY" http://127.0.0.1:8000/docs'
     assert page in connection_lines(deployment("noop"), urls, "127.0.0.1", tmp_path / "keys.json")
     elsewhere = deployment("noop", access={"keys_file": "/on/the/cluster/keys.json"})
     assert page in connection_lines(elsewhere, urls, "127.0.0.1")

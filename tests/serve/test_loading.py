@@ -134,7 +134,7 @@ def test_a_replica_warns_of_keys_that_come_unencrypted_unless_tls_ends_elsewhere
     access = {"keys_file": str(tmp_path / "keys"), "plain_http": plain}
     with pytest.raises(RayServeException, match="no engine"):
         asyncio.run(Bare.__init__(object.__new__(Bare), {"policy": "noop", "access": access}))
-    assert ("host 0.0.0.0: API keys come unencrypted" in caplog.text) == (not plain)
+    assert ("host 0.0.0.0: API keys cross the network unencrypted" in caplog.text) == (not plain)
 
 
 @pytest.mark.parametrize("method", PEER_METHODS)

@@ -102,7 +102,7 @@ def serve_command(options: ServeOptions) -> None:
             for line in connection_lines(with_gateways_at(config, host), server.apps, host, keys, insecure=insecure):
                 out.print(line)
             if address is None:
-                out.print(f"Ray programs of yours on this machine: vlagents_ray.join({server.url!r})")
+                out.print(f"in a Ray program on this machine: vlagents_ray.join({server.url!r})")
             out.print(f"log of Ray, Serve and HAProxy: {log}")
             with contextlib.suppress(KeyboardInterrupt):
                 out.print("Ctrl-C stops")
@@ -131,9 +131,9 @@ def connection_lines(
             with contextlib.suppress(ConfigError):  # the keys are on the cluster's machines
                 keyed = args.access.keys() is not None
         curl = 'curl -H "Authorization: Bearer $VLAGENTS_RAY_API_KEY" ' if keyed else ""
-        yield f"  how to talk to it: {curl}{url}/docs"
+        yield f"  API: {curl}{url}/docs"
         if not (insecure or args.access.insecure):  # --insecure shows no live page
-            yield f"  what it does now: {url}/live"
+            yield f"  live page: {url}/live"
         for name, one in args.dialects.describe().items():
             places = [one["address"]] if "address" in one else []
             for path in () if places else one["paths"]:  # such as "WS /openpi"

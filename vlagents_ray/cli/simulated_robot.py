@@ -143,7 +143,7 @@ class RobotRun:
             viewer=self._viewer,
             until=ended,
         )
-        counts = f"{robot.steps} steps, {report.interventions} of them an operator's; {report.paused} ticks paused"
+        counts = f"{robot.steps} steps, {report.interventions} by the operator; paused for {report.paused} ticks"
         out.print(f"  {label()}: {counts}")
 
     def _leader(self, contract: Contract, stack: contextlib.ExitStack) -> Leader | None:

@@ -109,7 +109,7 @@ class Keys:
                 found = known
         if found is None:
             self.audit.refused("", "an unknown key")
-            raise Unauthorized("this API key is not known here; ask the operator of the server for one")
+            raise Unauthorized("the server does not know this API key; ask its operator for one")
         caller = Caller(self, found, keys[found].name, app)
         caller.admit(free=True)
         return caller
@@ -372,7 +372,7 @@ def require_access(host: str, keys: Keys | None, insecure: bool) -> None:
         raise ConfigError(
             f"host {host}: any client that reaches this server could command the policy. Make keys "
             f"(`vlagents-ray keys new NAME --keys keys.json`) and serve with `--keys keys.json` (in a deployment file: "
-            f"`access: {{keys_file: PATH}}` under `args`); or say `--insecure` (`access: {{insecure: true}}`)"
+            f"`access: {{keys_file: PATH}}` under `args`); or use `--insecure` (`access: {{insecure: true}}`)"
         )
 
 
@@ -380,8 +380,8 @@ def warn_of_plain_http(host: str) -> None:
     """Log a warning if API keys would cross a network unencrypted."""
     if not is_loopback(host):
         logger.warning(
-            "host %s: API keys come unencrypted over the network, and others may read them: serve with --tls-cert and "
-            "--tls-key, or say that TLS ends elsewhere, with --plain-http (`access: {plain_http: true}`)",
+            "host %s: API keys cross the network unencrypted, where others may read them. Serve with --tls-cert and "
+            "--tls-key, or state that TLS ends elsewhere, with --plain-http (`access: {plain_http: true}`)",
             host,
         )
 
