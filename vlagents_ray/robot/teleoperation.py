@@ -76,7 +76,8 @@ class AxesLeader:
         spec = None if contract is None else contract.action
         if spec is None or spec.dim is None or spec.relative is None:
             raise ConfigError(
-                "teleoperation: the contract states no action.dim, or not whether actions are relative; want both"
+                f"teleoperation: got {spec} as the contract's action, want `dim`, and `delta` (whether actions are "
+                f"relative): state them in the policy's contract; with noop, serve it with `--set delta=false`"
             )
         if step is None and spec.relative and spec.low is not None and spec.high is not None:
             step = _SPEED * min(abs(spec.low), abs(spec.high))
