@@ -17,7 +17,7 @@ class NoopConfig(BaseModel, extra="forbid"):
     """Size of the zero action, and latency of the simulated model."""
 
     action_dim: int = Field(default=7, ge=1)
-    delta: bool | None = Field(default=None, description="whether the contract calls actions relative; None: not stated")
+    delta: bool | None = Field(default=None, description="whether the contract states relative actions")
     chunk: int = Field(default=1, ge=1, description="rows an `act` returns; 1 gives a single action, (D,)")
     base_ms: float = Field(default=0.0, ge=0, description="time a batch takes, whatever its size")
     per_item_ms: float = Field(default=0.0, ge=0, description="time that each item of a batch adds")
