@@ -52,20 +52,17 @@ class ProxiedSocket:
 
     def __init__(self, url: str, credentials: Credentials, timeout_s: float) -> None:
         """Connect; raises the errors of `websockets`."""
-        self._open = contextlib.ExitStack()
-        self._connection = self._open.enter_context(
-            connect(
-                url,
-                open_timeout=timeout_s,
-                close_timeout=1,
-                compression=None,
-                max_size=DEFAULT_LIMITS.body_bytes,
-                ssl=credentials.context(url),
-                additional_headers=credentials.headers,
-                logger=WEBSOCKET_LOG,
-            )
+        self._connection = connect(
+            url,
+            open_timeout=timeout_s,
+            close_timeout=1,
+            compression=None,
+            max_size=DEFAULT_LIMITS.body_bytes,
+            ssl=credentials.context(url),
+            additional_headers=credentials.headers,
+            logger=WEBSOCKET_LOG,
         )
-        self.close = self._open.close
+        self.close = self._connection.close
 
     def send(self, message: bytes, timeout_s: float) -> None:
         """Send a message within a time limit."""
@@ -241,9 +238,8 @@ class WebSocketTransport:
 
     def __init__(self, url: str, codec: CodecChoice, credentials: Credentials = ANONYMOUS) -> None:
         self._credentials = credentials
-        base = http_url(url)
+        self._base = base = http_url(url)
         scheme = "wss" if base.scheme == "https" else "ws"
-        self._base = base
         self._url = base._replace(scheme=scheme, path=base.path.rstrip("/") + "/v1/stream").geturl()
         self._codec = codec
         self._socket: ProxiedSocket | Stream | None = None
