@@ -88,10 +88,7 @@ class UnixTransport(ABC):
         self._writer = shm_layout.ShmWriter()
 
     def _send(self, connection: socket.socket, requests: Sequence[Request], deadline: float) -> None:
-        """Write requests to memory that the server reads, and send the message.
-
-        Raises `TimeoutError` or `OSError` on failure.
-        """
+        """Write requests to memory that the server reads, and send the message; raises `TimeoutError` or `OSError`."""
         try:
             while not self._is_free():  # the memory still holds requests that timed out
                 try:
