@@ -29,7 +29,6 @@ def request_from_parts(op: Op, text: str | bytes, images: Mapping[str, bytes], b
 
     The `budget` is charged before anything is decoded.
     """
-    limits = budget.limits
     budget.begin(op)
     document = parse_json(text, "obs:", _distinct, budget=budget)
     if not isinstance(document, dict):
@@ -49,14 +48,14 @@ def request_from_parts(op: Op, text: str | bytes, images: Mapping[str, bytes], b
     return check_request(
         Request(
             op=op,
-            obs=read_obs(obs, reader, limits),
+            obs=read_obs(obs, reader),
             instruction=document.get("instruction"),
             kwargs=reader.value(document.get("kwargs") or {}),
             contract=document.get("contract"),
             request_id=document.get("request_id", ""),
             deadline_ms=document.get("deadline_ms"),
         ),
-        limits,
+        budget.limits,
     )
 
 

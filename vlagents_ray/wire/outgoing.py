@@ -16,6 +16,7 @@ import numpy as np
 from vlagents_ray.contract import ActionSpec, CameraSpec, Contract, StateSpec
 from vlagents_ray.errors import ConfigError, InvalidAction, InvalidObservation, MissingCamera, MissingState
 from vlagents_ray.interface import Obs
+from vlagents_ray.validation import described
 from vlagents_ray.wire.mapping import KeyMapping, StateKey
 
 _MOST = 4096  # largest number of elements of a joined vector
@@ -211,6 +212,5 @@ def _joined(
 
 def _numbers(name: str, value: Any) -> np.ndarray:
     if not isinstance(value, np.ndarray) or value.dtype.kind not in "fiu" or not 0 < value.ndim <= 2:
-        shape = f"{value.shape} {value.dtype}" if isinstance(value, np.ndarray) else type(value).__name__
-        raise InvalidAction(f"{name!r}: got {shape}, want (D,) or (H, D) numbers")
+        raise InvalidAction(f"{name!r}: got {described(value)}, want (D,) or (H, D) numbers")
     return value.astype(np.float32)
