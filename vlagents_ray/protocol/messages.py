@@ -52,9 +52,8 @@ class Request:
     op: Op
     obs: Obs | None = None  # for reset, act and observe
     instruction: str | None = None  # reset only
-    kwargs: dict[str, Any] = field(
-        default_factory=dict
-    )  # for reset: `seed`, ...; for adopt: the reply to export; for weights: see `WeightUpdates.obey`
+    # for reset: `seed`, ...; for adopt: the reply to export; for weights: see `WeightUpdates.obey`
+    kwargs: dict[str, Any] = field(default_factory=dict)
     # reset only: the contract of the robot or the environment, which the server checks against the policy's
     contract: dict[str, Any] | None = None
     history: list[Obs] = field(default_factory=list)  # reset only: earlier observations of the session, oldest first
