@@ -61,10 +61,8 @@ def set_values(trainable: Any, named: Mapping[str, Any]) -> None:
             elif name in named:
                 container[key] = named[name]
         return
-    held = {
-        **dict(trainable.named_buffers(remove_duplicate=False)),
-        **dict(trainable.named_parameters(remove_duplicate=False)),
-    }
+    held = dict(trainable.named_buffers(remove_duplicate=False))
+    held |= trainable.named_parameters(remove_duplicate=False)
     with sys.modules["torch"].no_grad():
         for name, alias in trainable.state_dict().items():
             if name not in named:
