@@ -12,7 +12,7 @@ import io
 import json
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
@@ -36,9 +36,8 @@ class GR00TRequest:
     """A decoded request."""
 
     endpoint: str
-    data: dict[str, Any] = field(default_factory=dict)
-    api_token: str | None = None
-    packed: bool = False  # whether its arrays have the format of msgpack_numpy
+    data: dict[str, Any]
+    packed: bool  # whether its arrays have the format of msgpack_numpy
 
 
 @dataclass(frozen=True, slots=True)
@@ -93,7 +92,7 @@ def read_request(payload: bytes | memoryview, limits: Limits) -> GR00TRequest:
         raise MalformedMessage(f"gr00t: data: got {type(data).__name__}, want a map")
     if token is not None and not isinstance(token, str):
         raise MalformedMessage(f"gr00t: api_token: got {type(token).__name__}, want text")
-    return GR00TRequest(endpoint, data or {}, token, packed)
+    return GR00TRequest(endpoint, data or {}, packed)
 
 
 def read_observations(data: Mapping[str, Any]) -> Observations:
@@ -395,5 +394,6 @@ def _modality(name: str, value: Any) -> dict[str, list[Any]]:
         raise MalformedMessage(f"gr00t: modality {name[:40]!r}: want lists modality_keys and delta_indices")
     if not all(isinstance(key, str) for key in keys) or not all(type(step) is int for step in steps):
         raise MalformedMessage(f"gr00t: modality {name[:40]!r}: want texts and whole numbers in its lists")
-    shown = keys if name == "language" else [key.removeprefix(f"{name}.") for key in keys]
-    return {"keys": shown[:_KEYS_AT_MOST], "steps": steps}
+    if name != "language":
+        keys = [key.removeprefix(f"{name}.") for key in keys]
+    return {"keys": keys[:_KEYS_AT_MOST], "steps": steps}
