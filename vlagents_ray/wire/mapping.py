@@ -243,9 +243,7 @@ def read_image(key: str, value: Any, layout: str, limits: Limits) -> np.ndarray:
     """Return an image as (H, W, 3) uint8 RGB; raise `InvalidObservation` or `MessageTooLarge`."""
     if isinstance(value, np.ndarray):
         value = _newest(key, value, 3)
-        if (
-            value.dtype.kind == "f"
-        ):  # converted as in openpi's own server (`_parse_image` in its policies): rounded down
+        if value.dtype.kind == "f":  # as in openpi's own server (`_parse_image` in its policies): rounded down
             if value.size and not (value.min() >= 0 and value.max() <= 1):  # also true for NaN
                 raise InvalidObservation(
                     f"camera {key!r}: got {value.dtype} from {value.min():g} to {value.max():g}, want uint8, or floats "
@@ -412,7 +410,11 @@ class KeyMapping:
         obs = Obs(cameras, gripper, state, info)
         if not cameras or not state:
             self._require_read(flat, obs)
-        return obs, self._instruction(flat, limits, needed=contract is not None and bool(contract.instruction))
+        text = None
+        if self.instruction is not None and (found := pick(flat, "", self.instruction, True, MissingState)):
+            needed = contract is not None and bool(contract.instruction)
+            text = read_text(self.instruction, found[0][2], self.instructions, limits, needed=needed)
+        return obs, text
 
     def rows(self, action: np.ndarray, spec: ActionSpec | None = None) -> np.ndarray:
         """Return our action, (D,) or (H, D), as (H, D) float32 with the gripper's commands in the client's convention.
@@ -534,12 +536,6 @@ class KeyMapping:
                 f"{gripper.open:g} (open); scale it, or change mapping.gripper"
             )
         return min(1.0, max(0.0, opening))
-
-    def _instruction(self, flat: Mapping[str, Any], limits: Limits, *, needed: bool) -> str | None:
-        found = [] if self.instruction is None else pick(flat, "", self.instruction, True, MissingState)
-        if not found or self.instruction is None:
-            return None
-        return read_text(self.instruction, found[0][2], self.instructions, limits, needed=needed)
 
 
 @lru_cache(maxsize=64)  # each message is logged once
