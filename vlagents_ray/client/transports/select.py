@@ -8,7 +8,7 @@ from typing import Any, Literal, get_args
 from urllib.parse import urlsplit
 
 from vlagents_ray.client.credentials import Credentials
-from vlagents_ray.client.transports.base import CodecChoice, RequestChannel, Transport
+from vlagents_ray.client.transports.base import CodecChoice, Transport
 from vlagents_ray.client.transports.http import HttpTransport, http_url
 from vlagents_ray.client.transports.serve_handle import HandleTransport, PlasmaTransport
 from vlagents_ray.client.transports.shm import ShmTransport, reaches
@@ -30,7 +30,7 @@ class AutoTransport:
 
     def __init__(self, url: str, codec: CodecChoice, credentials: Credentials, *, only_shm: bool) -> None:
         self._credentials, self._url, self._codec, self._only_shm = credentials, url, codec, only_shm
-        self._chosen: RequestChannel | None = None
+        self._chosen: ShmTransport | PlasmaTransport | HandleTransport | WebSocketTransport | None = None
         self._handle: HandleTransport | None = None  # in addition to a channel to the same replica
 
     @property
