@@ -253,11 +253,9 @@ class ShmTransport(UnixTransport):
                 self._memories[memory.number] = _Memory(memory.number, mmap.mmap(-1, 1))
 
     def _answered(self, freed: int) -> None:
-        while freed:
-            number = freed.bit_length() - 1
-            freed -= 1 << number
-            if number < len(self._memories):
-                self._memories[number].busy = False
+        for memory in self._memories:
+            if freed >> memory.number & 1:
+                memory.busy = False
 
     def _memory(self, length: int) -> tuple[_Memory, int | None]:
         """Return free memory for `length` bytes, with its descriptor if the server has not received it yet."""
