@@ -27,7 +27,8 @@ from vlagents_ray.wire import msgpack
 ENDPOINTS = ("get_action", "reset", "ping", "get_modality_config")
 TEXT_KEY = "task"  # our key in "language", which replaces the client's
 _FLAT_TEXT_KEY = "annotation.human.task_description"  # the key of most of N1.5's robots
-_MODALITIES = ("video", "state", "language")
+_ARRAYS = ("video", "state")
+_MODALITIES = (*_ARRAYS, "language")
 _BATCH = 256  # maximum number of observations in one message
 
 
@@ -101,29 +102,25 @@ def read_observations(data: Mapping[str, Any]) -> Observations:
     observation = data["observation"] if paired else data
     flat = is_flat(observation)
     named = nested(observation) if flat else observation
-    video = _arrays(named.get("video"), "video")
-    state = _arrays(named.get("state"), "state")
-    axes = {array.ndim - usual for group, usual in ((video, 4), (state, 2)) for array in group.values()}
-    if not axes or not axes <= {0, 1} or len(axes) != 1:
-        shapes = {name: array.shape for name, array in list((video | state).items())[:8]}
+    groups = {kind: _arrays(named.get(kind), kind) for kind in _ARRAYS}
+    axes = {array.ndim - usual for kind, usual in (("video", 4), ("state", 2)) for array in groups[kind].values()}
+    if axes not in ({0}, {1}):
+        shapes = {name: array.shape for name, array in list((groups["video"] | groups["state"]).items())[:8]}
         raise InvalidObservation(f"observation: got {shapes}, want videos (B, T, H, W, 3) and states (B, T, D)")
     batched = axes == {1}
-    sizes = {array.shape[0] for group in (video, state) for array in group.values()} if batched else {1}
+    if not batched:
+        groups = {kind: {name: array[None] for name, array in group.items()} for kind, group in groups.items()}
+    arrays = [array for group in groups.values() for array in group.values()]
+    sizes = {array.shape[0] for array in arrays}
     if len(sizes) != 1 or not 0 < min(sizes) <= _BATCH:
         raise InvalidObservation(f"observation: got batches of {sorted(sizes)}, want the same, 1 to {_BATCH}, in all")
     number = sizes.pop()
     texts = _texts(named.get("language"), number)
-    if not batched:
-        video = {name: array[None] for name, array in video.items()}
-        state = {name: array[None] for name, array in state.items()}
-    if any(array.shape[1] == 0 for group in (video, state) for array in group.values()):
+    if any(array.shape[1] == 0 for array in arrays):
         raise InvalidObservation("observation: got no moment (T = 0), want one at least")
     each = tuple(
-        {
-            "video": {name: array[i] for name, array in video.items()},
-            "state": {name: array[i] for name, array in state.items()},
-            "language": {} if texts[i] is None else {TEXT_KEY: texts[i]},
-        }
+        {kind: {name: array[i] for name, array in group.items()} for kind, group in groups.items()}
+        | {"language": {} if texts[i] is None else {TEXT_KEY: texts[i]}}
         for i in range(number)
     )
     return Observations(each, batched, flat, paired)
@@ -139,7 +136,7 @@ def nested(flat: Mapping[str, Any]) -> dict[str, Any]:
     found: dict[str, Any] = {kind: {} for kind in _MODALITIES}
     for key, value in flat.items():
         kind, _, name = key.partition(".") if isinstance(key, str) else ("", "", "")
-        if kind in ("video", "state"):
+        if kind in _ARRAYS:
             found[kind][name] = value
         else:
             found["language"][key] = value
@@ -148,9 +145,8 @@ def nested(flat: Mapping[str, Any]) -> dict[str, Any]:
 
 def newest(observation: Mapping[str, Any]) -> dict[str, Any]:
     """Return an observation's last time step: {"video": {name: (H, W, 3)}, "state": {name: (D,)}, "language": ...}."""
-    return {kind: {name: array[-1] for name, array in observation[kind].items()} for kind in ("video", "state")} | {
-        "language": observation["language"]
-    }
+    arrays = {kind: {name: array[-1] for name, array in observation[kind].items()} for kind in _ARRAYS}
+    return arrays | {"language": observation["language"]}
 
 
 def write_actions(actions: Sequence[Mapping[str, np.ndarray]], asked: Observations, info: Mapping[str, Any]) -> Any:
@@ -303,7 +299,6 @@ PRESETS: dict[str, dict[str, Any]] = {
 # `msgpack_numpy`.
 
 _KEYS_AT_MOST = 64
-_ARRAYS = ("video", "state")
 _PACKED = "__ModalityConfig__"  # older servers write `__ModalityConfig_class__`
 
 
