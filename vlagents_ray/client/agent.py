@@ -51,8 +51,6 @@ _RESERVE_S, _RESERVE_SHARE = 0.5, 0.25
 
 @dataclass(slots=True)
 class EpisodeState:
-    """An episode in progress."""
-
     obs: Obs  # the first observation
     instruction: str | None
     kwargs: dict[str, Any]

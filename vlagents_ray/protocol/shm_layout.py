@@ -126,8 +126,6 @@ class ShmWriter:
 
 @dataclass(slots=True)
 class Written:
-    """Encoded acts, ready to be sent."""
-
     message: bytes
     size: int  # size of the memory for the arrays, bytes
     arrays: list[tuple[int, np.ndarray]]  # offset, array

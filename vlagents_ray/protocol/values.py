@@ -37,7 +37,6 @@ class ValueWriter:
         return {"$": ["nd", len(self.blobs) - 1, dtype.str, value.shape]}
 
     def image(self, file: bytes) -> dict[str, Any]:
-        """Return a reference to an encoded image."""
         self.blobs.append(file)
         return {"$": ["img", len(self.blobs) - 1]}
 

@@ -152,7 +152,6 @@ def mapped(function: Callable[[Any], Any], named: Mapping[str, Any]) -> dict[str
 
 
 def own_copy(value: Any) -> Any:
-    """Return a private copy of a value."""
     if _is_tensor(value):
         return value.detach().clone()
     return np.array(value) if isinstance(value, np.ndarray) else value  # JAX arrays never change
@@ -192,7 +191,6 @@ def dtype_name(value: Any) -> str:
 
 
 def is_array(value: Any) -> bool:
-    """Return whether a value is an array or a tensor."""
     return hasattr(value, "shape") and hasattr(value, "dtype")
 
 

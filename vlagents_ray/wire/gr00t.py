@@ -34,8 +34,6 @@ _BATCH = 256  # maximum number of observations in one message
 
 @dataclass(frozen=True, slots=True)
 class GR00TRequest:
-    """A decoded request."""
-
     endpoint: str
     data: dict[str, Any]
     packed: bool  # whether its arrays have the format of msgpack_numpy

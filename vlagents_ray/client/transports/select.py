@@ -77,7 +77,6 @@ class AutoTransport:
         return metadata
 
     def call(self, requests: Sequence[Request], timeout_s: float) -> list[Reply]:
-        """Send the requests by the chosen transport."""
         if self._chosen is None:
             raise NotReset("not connected; reset first")
         try:

@@ -144,7 +144,6 @@ class HandleTransport:
         return leased
 
     def close(self) -> None:
-        """Forget the replica."""
         self._replica = None
 
     def _lost(self, error: Exception) -> ConnectionLost:
