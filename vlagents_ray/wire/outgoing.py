@@ -69,12 +69,10 @@ class Outgoing:
             )
         if absent := [name for name in ranges if name not in named]:
             raise InvalidAction(f"action: got {sorted(named)[:16]}, which lacks {absent}; change mapping.action")
-        parts = {name: named[name] if named[name].ndim > 0 else named[name][None] for name in ranges}
-        heads = {part.shape[:-1] for part in parts.values()}
-        if len(heads) != 1:
-            shapes = {name: part.shape for name, part in parts.items()}
+        if len({named[name].shape[:-1] for name in ranges}) != 1:
+            shapes = {name: named[name].shape for name in ranges}
             raise InvalidAction(f"action: got {shapes}, want the same number of rows in all")
-        taken = {name: (one.start or 0, parts[name]) for name, one in ranges.items()}
+        taken = {name: (one.start or 0, named[name]) for name, one in ranges.items()}
         for name, (start, part) in taken.items():
             if (stop := ranges[name].stop) is not None and part.shape[-1] != stop - start:
                 raise InvalidAction(
