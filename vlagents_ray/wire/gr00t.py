@@ -22,6 +22,7 @@ from vlagents_ray.errors import InvalidObservation, MalformedMessage, MessageToo
 from vlagents_ray.protocol.frame_layout import read_array
 from vlagents_ray.protocol.messages import DEFAULT_LIMITS, Limits
 from vlagents_ray.registry import require
+from vlagents_ray.validation import described
 from vlagents_ray.wire import msgpack
 
 ENDPOINTS = ("get_action", "reset", "ping", "get_modality_config")
@@ -348,11 +349,9 @@ def read_actions(reply: Any, number: int) -> list[dict[str, np.ndarray]]:
     if not isinstance(actions, dict) or not actions:
         raise MalformedMessage(f"gr00t: got {type(actions).__name__} for an action, want a map of arrays")
     for name, array in actions.items():
-        if not isinstance(name, str) or not isinstance(array, np.ndarray) or array.ndim not in (2, 3):
-            got = f"{array.shape}" if isinstance(array, np.ndarray) else type(array).__name__
-            raise MalformedMessage(f"gr00t: action {shown(name)}: got {got}, want ({number}, H, D)")
-        if array.shape[0] != number:
-            raise MalformedMessage(f"gr00t: action {name[:40]!r}: got {array.shape}, want ({number}, H, D)")
+        is_array = isinstance(name, str) and isinstance(array, np.ndarray)
+        if not is_array or array.ndim not in (2, 3) or len(array) != number:
+            raise MalformedMessage(f"gr00t: action {shown(name)}: got {described(array)}, want ({number}, H, D)")
     return [
         {
             name.removeprefix("action."): array[i] if array.ndim == 3 else array[i][:, np.newaxis]
