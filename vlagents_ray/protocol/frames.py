@@ -175,8 +175,6 @@ def check_request(request: Request, limits: Limits) -> Request:
             raise MalformedMessage(f"{name}: got {type(value).__name__}, want an object")
     if request.rank not in RANKS:
         raise MalformedMessage(f"rank: got {shown(request.rank)}, want one of {list(RANKS)}")
-    if request.step is not None and (type(request.step) is not int or request.step < 0):
-        raise MalformedMessage(f"step: got {shown(request.step)}, want a whole number of acts")
     if request.deadline_ms is not None and not (
         is_number(request.deadline_ms) and 0 < request.deadline_ms < MOST_DEADLINE_MS
     ):
