@@ -307,17 +307,9 @@ def _newest(key: str, value: np.ndarray, ndim: int) -> np.ndarray:
 
 
 def read_text(key: str, value: Any, texts: Mapping[str, str], limits: Limits, *, needed: bool) -> str | None:
-    """Return an instruction.
+    """Return an instruction: a text, a list or array of one text, or the one of `texts` for an array of one integer.
 
-    Args:
-        key: The client's key, for errors.
-        value: A text, a list or array of one text, or an array of one integer.
-        texts: The text for each integer.
-        needed: Whether an integer without a text is an error; if not, there is no instruction.
-
-    Raises:
-        InvalidObservation: `value` has another type, or is an integer without a text that is needed.
-        MessageTooLarge: The text is too long.
+    An integer without a text is an error if the instruction is `needed`; if not, there is no instruction.
     """
     while isinstance(value, (list, tuple)) and len(value) == 1:  # some clients send a batch of one
         value = value[0]
