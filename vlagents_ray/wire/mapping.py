@@ -23,9 +23,10 @@ An observation is refused if the mapping reads nothing of it, or none of the cam
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import asdict, dataclass, field, fields
 from functools import lru_cache
+from itertools import islice
 from typing import Any, Literal, TypeVar
 
 import numpy as np
@@ -180,7 +181,7 @@ def lookup(nested: Mapping[Any, Any], path: str) -> Any:
 
 def keys(nested: Mapping[Any, Any]) -> list[str]:
     """Return the paths of all values that are not mappings, in order, at most 40, to be listed in an error."""
-    return [short_path(path) for path, _ in leaves(nested)]
+    return [short_path(path) for path, _ in islice(leaves(nested), _SHOWN)]
 
 
 def short_path(path: str) -> str:
@@ -188,18 +189,14 @@ def short_path(path: str) -> str:
     return "/".join(key[:_SHOWN] for key in path.split("/"))
 
 
-def leaves(nested: Mapping[Any, Any], prefix: str = "") -> list[tuple[str, Any]]:
-    """Return the paths and values of all values that are not mappings, in order, at most 40; see `short_path`."""
-    found: list[tuple[str, Any]] = []
+def leaves(nested: Mapping[Any, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
+    """Yield the paths and values of all values that are not mappings, in order; see `short_path`."""
     for key, value in nested.items():
-        if len(found) >= _SHOWN:
-            break
         path = f"{prefix}{(key if isinstance(key, str) else shown(key))[:_LONGEST]}"
         if isinstance(value, Mapping):
-            found += leaves(value, f"{path}/")
+            yield from leaves(value, f"{path}/")
         else:
-            found.append((path, value))
-    return found[:_SHOWN]
+            yield path, value
 
 
 def matches(name: str, pattern: str) -> bool:
@@ -479,7 +476,7 @@ class KeyMapping:
         patterns = [pattern for key in known for pattern in key.split("|")]
         return [
             short_path(path)
-            for path, value in leaves(flat)
+            for path, value in islice(leaves(flat), _SHOWN)
             if is_one(value) and not any(matches(path, pattern) for pattern in patterns)
         ]
 
@@ -497,9 +494,7 @@ class KeyMapping:
             ("cameras", images, obs.cameras, may_be_camera),
             ("state", numbers, obs.state, may_be_state),
         ):
-            if not wanted or found:
-                continue
-            if lost := self._unread(flat, is_one):
+            if wanted and not found and (lost := self._unread(flat, is_one)):
                 raise InvalidObservation(
                     f"observation: got {lost}, which the mapping does not read, and nothing at {wanted}; add them to "
                     f"mapping.{kind}, or to mapping.info if the policy does without"
