@@ -52,17 +52,20 @@ class ProxiedSocket:
 
     def __init__(self, url: str, credentials: Credentials, timeout_s: float) -> None:
         """Connect; raises the errors of `websockets`."""
-        self._connection = connect(
-            url,
-            open_timeout=timeout_s,
-            close_timeout=1,
-            compression=None,
-            max_size=DEFAULT_LIMITS.body_bytes,
-            ssl=credentials.context(url),
-            additional_headers=credentials.headers,
-            logger=WEBSOCKET_LOG,
+        self._open = contextlib.ExitStack()  # websockets 17.1 wants `connect` to be a context manager
+        self._connection = self._open.enter_context(
+            connect(
+                url,
+                open_timeout=timeout_s,
+                close_timeout=1,
+                compression=None,
+                max_size=DEFAULT_LIMITS.body_bytes,
+                ssl=credentials.context(url),
+                additional_headers=credentials.headers,
+                logger=WEBSOCKET_LOG,
+            )
         )
-        self.close = self._connection.close
+        self.close = self._open.close
 
     def send(self, message: bytes, timeout_s: float) -> None:
         """Send a message within a time limit."""
