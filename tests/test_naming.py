@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from vlagents_ray.naming import distinct, plain
+from vlagents_ray.naming import distinct, plain, without_doubles
 
 
 def test_a_name_is_numbered_only_where_it_would_be_anothers() -> None:
@@ -25,3 +26,10 @@ def test_no_two_names_become_the_same_in_whatever_order_they_come(names: list[st
     assert distinct(reversed(names)) == found
     assert all(found[name] == name for name in names if plain(name) == name)
     assert all(plain(own) == own for own in found.values())
+
+
+def test_the_second_of_a_key_is_found_among_many() -> None:
+    pairs = [(str(number), number) for number in range(200_000)]  # in quadratic time, it would take an hour
+    assert len(without_doubles(pairs)) == 200_000
+    with pytest.raises(ValueError, match="the key '199999' stands twice"):
+        without_doubles([*pairs, pairs[-1]])

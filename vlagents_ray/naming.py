@@ -1,10 +1,11 @@
-"""Distinct names for files, and suggestions for misspelt names."""
+"""Distinct names for files and in JSON objects, and suggestions for misspelt names."""
 
 from __future__ import annotations
 
 import difflib
 import functools
 import re
+from collections import Counter
 from collections.abc import Callable, Iterable
 from typing import Any, TypeVar
 
@@ -37,6 +38,15 @@ def did_you_mean(got: str, known: Iterable[str]) -> str:
     by_lower = {name.lower(): name for name in known}
     close = difflib.get_close_matches(got.lower(), by_lower, n=1)
     return f"; did you mean {by_lower[close[0]]!r}?" if close else ""
+
+
+def without_doubles(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    """Return a JSON object; raise `ValueError` if a key occurs twice, since either value could be meant."""
+    found = dict(pairs)
+    if len(found) < len(pairs):
+        [(twice, _)] = Counter(key for key, _ in pairs).most_common(1)  # in linear time, as the keys are a stranger's
+        raise ValueError(f"the key {twice[:80]!r} stands twice in one object")
+    return found
 
 
 def says_its_fields(hint: str = "") -> Callable[[type[T]], type[T]]:

@@ -18,14 +18,14 @@ def check_observation(obs: Obs, contract: Contract | None) -> None:
     """Raise `InvalidObservation` unless `obs` is well formed and has the inputs that `contract` names."""
     for name, image in obs.cameras.items():
         if not isinstance(image, np.ndarray) or image.ndim != 3 or image.shape[2] != 3 or image.dtype != _UINT8:
-            raise InvalidObservation(f"camera {name!r}: got {_describe(image)}, want (H, W, 3) uint8 RGB")
+            raise InvalidObservation(f"camera {name!r}: got {described(image)}, want (H, W, 3) uint8 RGB")
         if not image.size:
-            raise InvalidObservation(f"camera {name!r}: got {_describe(image)}, want one pixel at least")
+            raise InvalidObservation(f"camera {name!r}: got {described(image)}, want one pixel at least")
     if "" in obs.cameras or "" in obs.state:
         raise InvalidObservation("observation: got a camera or state without a name (''), want a name for each")
     for name, part in obs.state.items():
         if not isinstance(part, np.ndarray) or part.ndim != 1 or part.dtype.kind not in "fiu":
-            raise InvalidObservation(f"state {name!r}: got {_describe(part)}, want (D,) float32")
+            raise InvalidObservation(f"state {name!r}: got {described(part)}, want (D,) float32")
         if not _finite(part):
             raise InvalidObservation(f"state {name!r}: got NaN or infinity, want finite numbers; check the sensor")
     if obs.gripper is not None and not 0.0 <= obs.gripper <= 1.0:
@@ -33,7 +33,7 @@ def check_observation(obs: Obs, contract: Contract | None) -> None:
     if WANT in obs.info:
         wanted, offered = obs.info[WANT], (contract and contract.behaviour) or ()
         if not isinstance(wanted, list) or not all(isinstance(name, str) for name in wanted):
-            raise InvalidObservation(f"info[{WANT!r}]: got {_describe(wanted)}, want a list of names")
+            raise InvalidObservation(f"info[{WANT!r}]: got {described(wanted)}, want a list of names")
         if unknown := sorted(set(wanted) - set(offered)):
             raise NotOffered(
                 f"info[{WANT!r}]: got {unknown}, want some of {sorted(offered)}, the `behaviour` of the policy's "
@@ -68,9 +68,9 @@ def check_action(action: object, contract: Contract | None) -> np.ndarray:
     try:
         array = np.ascontiguousarray(action, dtype=_FLOAT32)
     except (TypeError, ValueError, RuntimeError) as error:  # RuntimeError: a torch tensor that requires grad
-        raise InvalidAction(f"action: got {_describe(action)}, want (D,) or (H, D) float32") from error
+        raise InvalidAction(f"action: got {described(action)}, want (D,) or (H, D) float32") from error
     if array.ndim not in (1, 2) or array.size == 0:
-        raise InvalidAction(f"action: got {_describe(action)}, want (D,) or (H, D) float32")
+        raise InvalidAction(f"action: got {described(action)}, want (D,) or (H, D) float32")
     if not _finite(array):
         raise InvalidAction("action: got NaN or infinity; the policy's output is broken")
     if contract is not None and contract.action.dim not in (None, array.shape[-1]):
@@ -85,5 +85,6 @@ def _finite(array: np.ndarray) -> bool:
     return bool(np.isfinite(array).all())
 
 
-def _describe(value: object) -> str:
+def described(value: object) -> str:
+    """Return the shape and type of an array, or the type of any other value, for an error."""
     return f"{value.shape} {value.dtype}" if isinstance(value, np.ndarray) else type(value).__name__

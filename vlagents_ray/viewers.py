@@ -112,8 +112,6 @@ class RerunRecordings:
 
 
 class RerunEpisode:
-    """The recording of one episode."""
-
     def __init__(self, rerun: Any, recording: Any, instruction: str, *, live: bool) -> None:
         self._rerun, self._recording, self._live = rerun, recording, live
         if instruction:
@@ -255,7 +253,6 @@ class EpisodeViewer:
                 pass
 
     def _until_the_end(self) -> Iterator[ViewerFrame]:
-        """Yield the frames of an episode as they arrive."""
         while isinstance(frame := self._queue.get(), ViewerFrame):
             yield frame
             self._got += 1
@@ -265,7 +262,6 @@ class LoopView:
     """Shows one run in a viewer; does nothing if there is no viewer."""
 
     def __init__(self, viewer: EpisodeViewer | None) -> None:
-        """Show a run in `viewer`."""
         self._viewer = viewer
         self._chunk: np.ndarray | None = None  # the last chunk that was shown
         self._note = ""

@@ -83,7 +83,7 @@ def entry(**changed: Any) -> dict[str, Any]:
         (header(b"\x80"), "no JSON document"),
         (header(b"[" * 100_000), "no JSON document"),
         (header(b'{"w": 1' + b"0" * 5000 + b"}"), "a number of 5001 digits"),
-        (header(b'{"w": {}, "w": {}}'), "a name stands there twice"),
+        (header(b'{"w": {}, "w": {}}'), "the key 'w' stands twice"),
         (header([]), "got list, want an object"),
         (header({"w": 1}), "'w': want 'dtype'"),
         (header({"w" * 513: entry()["w"]}), "a name of 513 characters"),

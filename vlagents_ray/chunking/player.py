@@ -117,8 +117,6 @@ class AsyncCaller:
 
 
 class _Request(NamedTuple):
-    """A request to the policy."""
-
     tick: int = -1
     step: int = 0  # `ChunkBuffer.executed` at its observation: the position of the answer's first row
     seen_at: float = 0.0  # s, of `time.monotonic`: the capture time of the observation

@@ -51,8 +51,6 @@ _RESERVE_S, _RESERVE_SHARE = 0.5, 0.25
 
 @dataclass(slots=True)
 class EpisodeState:
-    """An episode in progress."""
-
     obs: Obs  # the first observation
     instruction: str | None
     kwargs: dict[str, Any]
@@ -99,12 +97,6 @@ class ClientSession:
         self.step = reply.step
         if self.episode is not None:
             self.episode.step = reply.step
-
-    def acted(self, obs: Obs, reply: Reply) -> None:
-        """Record that `obs` was answered."""
-        self.begun(reply)
-        if self.episode is not None and self.episode.recent.maxlen:
-            self.episode.recent.append(copied(obs))
 
     def is_lost(self, reply: Reply) -> bool:
         """Return whether the session must be resumed; if not, its replica checks that no answer was lost."""
@@ -426,7 +418,9 @@ class RemoteAgent(Agent):
             elif isinstance(reply.error, (ConnectionLost, UnknownSession)) and not self._resume:
                 session.episode = None
             return reply.error or PolicyFailed("act: the server's reply holds no action")
-        session.acted(obs, reply)
+        session.begun(reply)
+        if episode.recent.maxlen:
+            episode.recent.append(copied(obs))
         timing = reply.act.info["timing"] = reply.timing
         timing["round_trip_ms"] = round_trip_ms
         if "total_ms" in timing:
@@ -436,11 +430,8 @@ class RemoteAgent(Agent):
 
 def _deadline_s(obs: Sequence[Obs]) -> float:
     """Return the time, s, until the most urgent observation no longer needs an answer."""
-    soonest_ms = math.inf
-    for one in obs:
-        if DEADLINE in one.info:
-            value = one.info[DEADLINE]
-            if not isinstance(value, (int, float)) or not value > 0:
-                raise InvalidObservation(f"info[{DEADLINE!r}]: got {value!r}, want milliseconds above 0")
-            soonest_ms = min(soonest_ms, value)
-    return soonest_ms / 1e3
+    stated_ms = [one.info[DEADLINE] for one in obs if DEADLINE in one.info]
+    for value in stated_ms:
+        if not isinstance(value, (int, float)) or not value > 0:
+            raise InvalidObservation(f"info[{DEADLINE!r}]: got {value!r}, want milliseconds above 0")
+    return min(stated_ms, default=math.inf) / 1e3

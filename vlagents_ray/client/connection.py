@@ -70,7 +70,6 @@ class Connection:
         self._requests = 0
 
     def request_id(self) -> str:
-        """Return a new unique request id."""
         self._requests += 1
         return f"{self._prefix}-{self._requests:x}"
 

@@ -57,10 +57,7 @@ class Credentials:
             warn_of_plain_http(f"{parts.scheme}://{parts.netloc.rpartition('@')[2]}")
 
     def context(self, url: str) -> ssl.SSLContext | None:
-        """Return the TLS context for a URL; None if the URL is not encrypted.
-
-        Raises `ConfigError` for an unusable file.
-        """
+        """Return the TLS context for a URL, None if it is not encrypted; raises `ConfigError` for an unusable file."""
         if urlsplit(url).scheme not in ("https", "wss"):
             return None
         try:
@@ -96,10 +93,7 @@ def warn_of_plain_http(origin: str) -> None:
 
 
 def tls_failure(url: str, error: ssl.SSLError) -> VLAgentsError:
-    """Return the error for a failed TLS handshake, with its cure.
-
-    Only a connection that just ended is worth a retry.
-    """
+    """Return the error for a failed TLS handshake, with its cure; only a lost connection is worth a retry."""
     if isinstance(error, (ssl.SSLEOFError, ssl.SSLZeroReturnError)):
         return ConnectionLost(f"{url}: the connection ended ({error}); does the server speak TLS at this port?")
     if isinstance(error, ssl.SSLCertVerificationError):

@@ -5,13 +5,16 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
-from typing import Protocol, TypeVar
+from typing import TYPE_CHECKING, TypeVar
 
 import numpy as np
 
 from vlagents_ray.errors import InvalidInput
 from vlagents_ray.images import jpeg_png
 from vlagents_ray.images.thread_map import thread_map
+
+if TYPE_CHECKING:
+    from vlagents_ray.protocol.messages import Budget
 
 T = TypeVar("T")
 
@@ -52,24 +55,6 @@ class ImageCodec:
         return jpeg_png.encode_png(image)
 
 
-DecodedFiles = dict[int, tuple[np.ndarray, "bytes | memoryview"]]
-"""Each image with the file from which it was decoded, by the `id` of the image."""
-
-
-class PixelBudget(Protocol):
-    """The limits of a message; see `vlagents_ray.protocol.messages`."""
-
-    serial: bool
-    files: DecodedFiles | None  # receives the files of decoded images; None if not needed
-
-    @property
-    def pixels(self) -> int:
-        """The largest number of pixels of one image."""
-
-    def hold(self, size: int) -> None:
-        """Reserve `size` bytes of memory; raises an error if they exceed the limits."""
-
-
 RAW = ImageCodec("raw")
 LOSSLESS = ImageCodec("lossless")
 JPEG = ImageCodec("jpeg")
@@ -81,9 +66,7 @@ def encode_files(cameras: Sequence[np.ndarray], codec: ImageCodec) -> list[bytes
     return thread_map(codec.file, cameras, work_s)
 
 
-def decode_files(
-    files: Sequence[bytes | memoryview], budget: PixelBudget, names: Sequence[str] = ()
-) -> list[np.ndarray]:
+def decode_files(files: Sequence[bytes | memoryview], budget: Budget, names: Sequence[str] = ()) -> list[np.ndarray]:
     """Decode JPEG or PNG files to (H, W, 3) uint8 RGB images, after reserving memory for all of them.
 
     Errors name the camera of a file if `names` has it.
@@ -92,7 +75,7 @@ def decode_files(
         MalformedMessage: A file cannot be decoded.
         MessageTooLarge: The images exceed the limits.
     """
-    most = budget.pixels
+    most = budget.limits.pixels
 
     def attributed(read: Callable[[bytes | memoryview, int], T], file: bytes | memoryview) -> T:
         try:

@@ -142,7 +142,6 @@ def _decode_own_png(view: memoryview, height: int, width: int) -> np.ndarray | N
 
 
 def _chunk_name(view: memoryview, at: int) -> bytes:
-    """Return the name of the chunk that starts at a position."""
     return bytes(view[at + 4 : at + 8])
 
 

@@ -111,14 +111,15 @@ def decode_requests(data: Buffer, budget: Budget, ops: Sequence[Op] = OPS) -> De
         try:
             budget.begin(node.get("op"), node.get("rank"))
             reader.begin()
-            decoded.requests.append(_read_request(node, reader, limits, ops))
+            decoded.requests.append(_read_request(node, reader, ops))
         except VLAgentsError as error:
             name = node.get("request_id")
             decoded.refused[place] = Reply(name if isinstance(name, str) and is_name(name) else "", error=error)
     return decoded
 
 
-def _read_request(node: dict[str, Any], reader: ValueReader, limits: Limits, ops: Sequence[Op] = OPS) -> Request:
+def _read_request(node: dict[str, Any], reader: ValueReader, ops: Sequence[Op]) -> Request:
+    limits = reader.limits
     if unknown := node.keys() - _REQUEST_KEYS:
         raise MalformedMessage(f"request: unknown keys {shown(sorted(unknown))}, want some of {sorted(_REQUEST_KEYS)}")
     if node.get("op") not in ops:
@@ -133,11 +134,11 @@ def _read_request(node: dict[str, Any], reader: ValueReader, limits: Limits, ops
     return check_request(
         Request(
             op=cast(Op, node["op"]),
-            obs=None if obs is None else read_obs(obs, reader, limits),
+            obs=None if obs is None else read_obs(obs, reader),
             instruction=node.get("instruction"),
             kwargs=reader.value(node.get("kwargs") or {}),
             contract=node.get("contract"),
-            history=[read_obs(one, reader, limits) for one in history],
+            history=[read_obs(one, reader) for one in history],
             step=_step(node),
             **{name: node.get(name, default) for name, default in _OPTIONAL.items()},
         ),
@@ -174,8 +175,6 @@ def check_request(request: Request, limits: Limits) -> Request:
             raise MalformedMessage(f"{name}: got {type(value).__name__}, want an object")
     if request.rank not in RANKS:
         raise MalformedMessage(f"rank: got {shown(request.rank)}, want one of {list(RANKS)}")
-    if request.step is not None and (type(request.step) is not int or request.step < 0):
-        raise MalformedMessage(f"step: got {shown(request.step)}, want a whole number of acts")
     if request.deadline_ms is not None and not (
         is_number(request.deadline_ms) and 0 < request.deadline_ms < MOST_DEADLINE_MS
     ):
@@ -231,13 +230,13 @@ def _write_reply(reply: Reply, writer: ValueWriter) -> dict[str, Any]:
     return node
 
 
-def decode_replies(data: Buffer, limits: Limits = DEFAULT_LIMITS) -> list[Reply]:
+def decode_replies(data: Buffer) -> list[Reply]:
     """Decode the replies in a frame, at least one."""
-    header, blobs = unpack(data, limits)
+    header, blobs = unpack(data, DEFAULT_LIMITS)
     nodes = header.get("replies", [header])
     if not isinstance(nodes, list) or {*map(type, nodes)} != {dict}:
         raise MalformedMessage(f"replies: got {shown(nodes)}, want a list of replies")
-    return [_read_reply(node, ValueReader(blobs, Budget(limits))) for node in nodes]
+    return [_read_reply(node, ValueReader(blobs, Budget(DEFAULT_LIMITS))) for node in nodes]
 
 
 def _read_reply(node: dict[str, Any], reader: ValueReader) -> Reply:

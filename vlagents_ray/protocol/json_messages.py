@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 
 from vlagents_ray.errors import MalformedMessage, VLAgentsError, shown
+from vlagents_ray.naming import without_doubles
 from vlagents_ray.protocol.frame_layout import parse_json
 from vlagents_ray.protocol.frames import check_request, describe_error
 from vlagents_ray.protocol.messages import Budget, Op, Reply, Request
@@ -29,9 +30,8 @@ def request_from_parts(op: Op, text: str | bytes, images: Mapping[str, bytes], b
 
     The `budget` is charged before anything is decoded.
     """
-    limits = budget.limits
     budget.begin(op)
-    document = parse_json(text, "obs:", _distinct, budget=budget)
+    document = parse_json(text, "obs:", without_doubles, budget=budget)
     if not isinstance(document, dict):
         raise MalformedMessage(f"obs: got {type(document).__name__}, want an object")
     unknown = document.keys() - _KEYS
@@ -49,25 +49,15 @@ def request_from_parts(op: Op, text: str | bytes, images: Mapping[str, bytes], b
     return check_request(
         Request(
             op=op,
-            obs=read_obs(obs, reader, limits),
+            obs=read_obs(obs, reader),
             instruction=document.get("instruction"),
             kwargs=reader.value(document.get("kwargs") or {}),
             contract=document.get("contract"),
             request_id=document.get("request_id", ""),
             deadline_ms=document.get("deadline_ms"),
         ),
-        limits,
+        budget.limits,
     )
-
-
-def _distinct(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
-    """Return a JSON object; raise an error if a key occurs twice, since either value could be meant."""
-    found = dict(pairs)
-    if len(found) < len(pairs):
-        keys = [key for key, _ in pairs]
-        twice = next(key for key in keys if keys.count(key) > 1)
-        raise ValueError(f"the key {twice[:80]!r} stands twice in one object")
-    return found
 
 
 def reply_to_json(reply: Reply) -> dict[str, Any]:

@@ -9,8 +9,9 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, ClassVar, Literal
 
+import numpy as np
+
 from vlagents_ray.errors import MalformedMessage, MessageTooLarge, VLAgentsError
-from vlagents_ray.images.codecs import DecodedFiles
 from vlagents_ray.interface import Act, Obs
 
 PROTOCOL_VERSION = 1
@@ -52,9 +53,8 @@ class Request:
     op: Op
     obs: Obs | None = None  # for reset, act and observe
     instruction: str | None = None  # reset only
-    kwargs: dict[str, Any] = field(
-        default_factory=dict
-    )  # for reset: `seed`, ...; for adopt: the reply to export; for weights: see `WeightUpdates.obey`
+    # for reset: `seed`, ...; for adopt: the reply to export; for weights: see `WeightUpdates.obey`
+    kwargs: dict[str, Any] = field(default_factory=dict)
     # reset only: the contract of the robot or the environment, which the server checks against the policy's
     contract: dict[str, Any] | None = None
     history: list[Obs] = field(default_factory=list)  # reset only: earlier observations of the session, oldest first
@@ -182,6 +182,8 @@ def is_loopback(host: str) -> bool:
 # The cost of a message, which is checked before any of the message is decoded.
 
 
+DecodedFiles = dict[int, tuple[np.ndarray, "bytes | memoryview"]]
+"""Each image with the file from which it was decoded, by the `id` of the image."""
 _JSON_FACTOR = 4  # size of the parsed Python objects per byte of JSON, within the limits of `frame_layout`
 
 
@@ -197,13 +199,8 @@ class Budget:
     def __init__(self, limits: Limits) -> None:
         self.limits = limits
         self.serial = False  # whether images are decoded one after the other
-        self.files: DecodedFiles | None = None  # see `PixelBudget`
+        self.files: DecodedFiles | None = None  # receives the files of decoded images; None if not needed
         self._left = limits.decoded_bytes
-
-    @property
-    def pixels(self) -> int:
-        """The maximum number of pixels of one image."""
-        return self.limits.pixels
 
     def begin_message(self) -> None:
         """Count the message for its sender before any of it is parsed; raise an error if it is refused."""

@@ -126,8 +126,6 @@ class ShmWriter:
 
 @dataclass(slots=True)
 class Written:
-    """Encoded acts, ready to be sent."""
-
     message: bytes
     size: int  # size of the memory for the arrays, bytes
     arrays: list[tuple[int, np.ndarray]]  # offset, array
@@ -338,8 +336,6 @@ def read_answers(message: memoryview) -> list[Reply]:
             version, digest = WEIGHTS.unpack_from(message, named)
             named += WEIGHTS.size
             info = {POLICY: {"version": version, "fingerprint": _text(digest)}}
-        act = Act(action, bool(flags & _DONE), info)
-        reply = Reply(request_id.rstrip(b"\0").decode(), act, step=step, timing=timing)
-        reply.draining = bool(flags & _DRAINING)
-        replies.append(reply)
+        act, draining = Act(action, bool(flags & _DONE), info), bool(flags & _DRAINING)
+        replies.append(Reply(request_id.rstrip(b"\0").decode(), act, step=step, draining=draining, timing=timing))
     return replies

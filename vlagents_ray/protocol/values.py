@@ -15,6 +15,7 @@ from vlagents_ray.images.codecs import ImageCodec, decode_files, encode_files
 from vlagents_ray.interface import Obs
 from vlagents_ray.protocol.frame_layout import Buffer, is_plain, parse_json, read_array
 from vlagents_ray.protocol.messages import NAME_CHARACTERS, Budget, Limits
+from vlagents_ray.validation import described
 
 _UINT8, _FLOAT32 = np.dtype(np.uint8), np.dtype(np.float32)
 _OBS_KEYS = {"cameras", "gripper", "state", "info"}
@@ -36,7 +37,6 @@ class ValueWriter:
         return {"$": ["nd", len(self.blobs) - 1, dtype.str, value.shape]}
 
     def image(self, file: bytes) -> dict[str, Any]:
-        """Return a reference to an encoded image."""
         self.blobs.append(file)
         return {"$": ["img", len(self.blobs) - 1]}
 
@@ -70,7 +70,7 @@ class ValueReader:
 
     def __init__(self, blobs: Sequence[Buffer], budget: Budget) -> None:
         self._blobs, self._budget = blobs, budget
-        self._limits = budget.limits
+        self.limits = budget.limits
         self._items = 0
         self._images: dict[int, np.ndarray] = {}  # by blob: each image is decoded once, whatever its number of uses
         self._copies: dict[int, bytes] = {}  # by blob: the bytes of each are copied once
@@ -96,17 +96,17 @@ class ValueReader:
     def value(self, node: Any, depth: int = 0) -> Any:
         """Return the value of a JSON node; raise `MalformedMessage` or `MessageTooLarge` if it is invalid."""
         self._items += 1
-        if self._items > self._limits.items:
-            raise MessageTooLarge(f"info: more than {self._limits.items} values; send arrays instead of lists")
+        if self._items > self.limits.items:
+            raise MessageTooLarge(f"info: more than {self.limits.items} values; send arrays instead of lists")
+        if not isinstance(node, (dict, list)):
+            return node
+        if isinstance(node, dict) and "$" in node:
+            return self.blob(node)
+        if depth >= self.limits.depth:
+            raise MessageTooLarge(f"info: nested deeper than {self.limits.depth}; flatten it")
         if isinstance(node, dict):
-            if "$" in node:
-                return self.blob(node)
-            self._nest(depth)
             return {key: self.value(item, depth + 1) for key, item in node.items()}
-        if isinstance(node, list):
-            self._nest(depth)
-            return [self.value(item, depth + 1) for item in node]
-        return node
+        return [self.value(item, depth + 1) for item in node]
 
     def blob(self, node: Any) -> Any:
         """Return the array, image, bytes or number that `{"$": [...]}` refers to."""
@@ -146,10 +146,6 @@ class ValueReader:
             self._budget.count(len(data))
         return known
 
-    def _nest(self, depth: int) -> None:
-        if depth >= self._limits.depth:
-            raise MessageTooLarge(f"info: nested deeper than {self._limits.depth}; flatten it")
-
     def _get(self, index: Any) -> Buffer:
         if type(index) is not int or not 0 <= index < len(self._blobs):
             raise MalformedMessage(f"reference: got blob {shown(index, 20)}, want a number below {len(self._blobs)}")
@@ -162,8 +158,9 @@ def _reference(node: Any) -> list[Any]:
     return reference if isinstance(reference, list) else []
 
 
-def read_obs(node: Any, reader: ValueReader, limits: Limits) -> Obs:
+def read_obs(node: Any, reader: ValueReader) -> Obs:
     """Read an observation from its JSON form, in which cameras and state parts may be references or lists."""
+    limits = reader.limits
     if not isinstance(node, dict):
         raise MalformedMessage(f"obs: got {type(node).__name__}, want an object")
     if unknown := node.keys() - _OBS_KEYS:
@@ -197,8 +194,7 @@ def read_obs(node: Any, reader: ValueReader, limits: Limits) -> Obs:
 def as_camera(name: str, image: Any, limits: Limits) -> np.ndarray:
     """Return `image` unchanged if it is (H, W, 3) uint8 RGB within the limits; errors mention `name`."""
     if not isinstance(image, np.ndarray) or image.ndim != 3 or image.shape[2] != 3 or image.dtype != _UINT8:
-        got = f"{image.shape} {image.dtype}" if isinstance(image, np.ndarray) else type(image).__name__
-        raise InvalidObservation(f"camera {name!r}: got {got}, want (H, W, 3) uint8 RGB")
+        raise InvalidObservation(f"camera {name!r}: got {described(image)}, want (H, W, 3) uint8 RGB")
     if image.shape[0] * image.shape[1] > limits.pixels:
         raise MessageTooLarge(
             f"camera {name!r}: got {image.shape[:2]} pixels, the limit is {limits.pixels}; send it smaller, or raise "
@@ -209,26 +205,19 @@ def as_camera(name: str, image: Any, limits: Limits) -> np.ndarray:
 
 def as_state(name: str, part: Any, limits: Limits) -> np.ndarray:
     """Convert `part`, a list of numbers or an array, to (D,) float32 within the limits; errors mention `name`."""
-    if isinstance(part, list):
-        if len(part) > limits.state_values:
-            raise MessageTooLarge(f"state {name!r}: got {len(part)} values, the limit is {limits.state_values}")
-        if not all(is_number(x) for x in part):
-            raise InvalidObservation(f"state {name!r}: want a list of numbers")
-        return _single(name, np.array(part, dtype=np.float64))
-    if not isinstance(part, np.ndarray) or part.ndim != 1 or part.dtype.kind not in "fiu":
-        got = f"{part.shape} {part.dtype}" if isinstance(part, np.ndarray) else type(part).__name__
-        raise InvalidObservation(f"state {name!r}: got {got}, want (D,) float32")
-    if part.size > limits.state_values:
-        raise MessageTooLarge(f"state {name!r}: got {part.size} values, the limit is {limits.state_values}")
-    return _single(name, part)
-
-
-def _single(name: str, part: np.ndarray) -> np.ndarray:
-    if part.dtype == _FLOAT32:  # numpy's `errstate` takes longer than all other work on a state
-        return part
+    is_list = isinstance(part, list)
+    if not is_list and (not isinstance(part, np.ndarray) or part.ndim != 1 or part.dtype.kind not in "fiu"):
+        raise InvalidObservation(f"state {name!r}: got {described(part)}, want (D,) float32")
+    if len(part) > limits.state_values:
+        raise MessageTooLarge(f"state {name!r}: got {len(part)} values, the limit is {limits.state_values}")
+    if is_list and not all(is_number(x) for x in part):
+        raise InvalidObservation(f"state {name!r}: want a list of numbers")
+    array: np.ndarray = np.array(part, dtype=np.float64) if is_list else part
+    if array.dtype == _FLOAT32:  # numpy's `errstate` takes longer than all other work on a state
+        return array
     try:
         with np.errstate(over="raise"):
-            return part.astype(np.float32, copy=False)
+            return array.astype(np.float32)
     except FloatingPointError as error:
         raise InvalidObservation(f"state {name!r}: got a number beyond those of float32, want it within") from error
 

@@ -24,10 +24,9 @@ from enum import IntEnum
 from typing import TYPE_CHECKING, Any, TypeVar
 
 from vlagents_ray.errors import VLAgentsError
-from vlagents_ray.images.codecs import DecodedFiles
 from vlagents_ray.protocol.frames import Decoded, encode_replies
 from vlagents_ray.protocol.json_messages import reply_to_json
-from vlagents_ray.protocol.messages import Reply, Request
+from vlagents_ray.protocol.messages import DecodedFiles, Reply, Request
 from vlagents_ray.protocol.shm_layout import write_answers
 from vlagents_ray.serve.queue.preparation import Preparation
 

@@ -17,6 +17,7 @@ from typing import Any, BinaryIO
 import numpy as np
 
 from vlagents_ray.errors import InvalidWeights, MalformedMessage, shown
+from vlagents_ray.naming import without_doubles
 
 MESSAGE_BYTES = 2**22  # longest message with weights: a header (about 40,000 values), or a part of their bytes
 PART_BYTES = 2**20  # bytes of a part; while a replica reads longer parts, its acts wait for Python's lock
@@ -92,7 +93,7 @@ def read_header(data: bytes) -> dict[str, ValueSpec]:
             f"of the header, and the header, at most {MESSAGE_BYTES} together"
         )
     try:
-        document = json.loads(data[_LENGTH.size :], parse_int=_whole, object_pairs_hook=_without_doubles)
+        document = json.loads(data[_LENGTH.size :], parse_int=_whole, object_pairs_hook=without_doubles)
     except (ValueError, RecursionError) as error:
         raise MalformedMessage(f"safetensors: the header is no JSON document ({error})") from error
     if not isinstance(document, dict):
@@ -134,13 +135,6 @@ def _whole(text: str) -> int:
     if len(text) > _DIGITS:
         raise ValueError(f"a number of {len(text)} digits")
     return int(text)
-
-
-def _without_doubles(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
-    found = dict(pairs)
-    if len(found) != len(pairs):
-        raise ValueError("a name stands there twice")
-    return found
 
 
 class ValuesReader:

@@ -61,10 +61,8 @@ def set_values(trainable: Any, named: Mapping[str, Any]) -> None:
             elif name in named:
                 container[key] = named[name]
         return
-    held = {
-        **dict(trainable.named_buffers(remove_duplicate=False)),
-        **dict(trainable.named_parameters(remove_duplicate=False)),
-    }
+    held = dict(trainable.named_buffers(remove_duplicate=False))
+    held |= trainable.named_parameters(remove_duplicate=False)
     with sys.modules["torch"].no_grad():
         for name, alias in trainable.state_dict().items():
             if name not in named:
@@ -154,7 +152,6 @@ def mapped(function: Callable[[Any], Any], named: Mapping[str, Any]) -> dict[str
 
 
 def own_copy(value: Any) -> Any:
-    """Return a private copy of a value."""
     if _is_tensor(value):
         return value.detach().clone()
     return np.array(value) if isinstance(value, np.ndarray) else value  # JAX arrays never change
@@ -194,7 +191,6 @@ def dtype_name(value: Any) -> str:
 
 
 def is_array(value: Any) -> bool:
-    """Return whether a value is an array or a tensor."""
     return hasattr(value, "shape") and hasattr(value, "dtype")
 
 

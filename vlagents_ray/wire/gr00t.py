@@ -12,7 +12,7 @@ import io
 import json
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
@@ -22,23 +22,22 @@ from vlagents_ray.errors import InvalidObservation, MalformedMessage, MessageToo
 from vlagents_ray.protocol.frame_layout import read_array
 from vlagents_ray.protocol.messages import DEFAULT_LIMITS, Limits
 from vlagents_ray.registry import require
+from vlagents_ray.validation import described
 from vlagents_ray.wire import msgpack
 
 ENDPOINTS = ("get_action", "reset", "ping", "get_modality_config")
 TEXT_KEY = "task"  # our key in "language", which replaces the client's
 _FLAT_TEXT_KEY = "annotation.human.task_description"  # the key of most of N1.5's robots
-_MODALITIES = ("video", "state", "language")
+_ARRAYS = ("video", "state")
+_MODALITIES = (*_ARRAYS, "language")
 _BATCH = 256  # maximum number of observations in one message
 
 
 @dataclass(frozen=True, slots=True)
 class GR00TRequest:
-    """A decoded request."""
-
     endpoint: str
-    data: dict[str, Any] = field(default_factory=dict)
-    api_token: str | None = None
-    packed: bool = False  # whether its arrays have the format of msgpack_numpy
+    data: dict[str, Any]
+    packed: bool  # whether its arrays have the format of msgpack_numpy
 
 
 @dataclass(frozen=True, slots=True)
@@ -93,7 +92,7 @@ def read_request(payload: bytes | memoryview, limits: Limits) -> GR00TRequest:
         raise MalformedMessage(f"gr00t: data: got {type(data).__name__}, want a map")
     if token is not None and not isinstance(token, str):
         raise MalformedMessage(f"gr00t: api_token: got {type(token).__name__}, want text")
-    return GR00TRequest(endpoint, data or {}, token, packed)
+    return GR00TRequest(endpoint, data or {}, packed)
 
 
 def read_observations(data: Mapping[str, Any]) -> Observations:
@@ -102,29 +101,25 @@ def read_observations(data: Mapping[str, Any]) -> Observations:
     observation = data["observation"] if paired else data
     flat = is_flat(observation)
     named = nested(observation) if flat else observation
-    video = _arrays(named.get("video"), "video")
-    state = _arrays(named.get("state"), "state")
-    axes = {array.ndim - usual for group, usual in ((video, 4), (state, 2)) for array in group.values()}
-    if not axes or not axes <= {0, 1} or len(axes) != 1:
-        shapes = {name: array.shape for name, array in list((video | state).items())[:8]}
+    groups = {kind: _arrays(named.get(kind), kind) for kind in _ARRAYS}
+    axes = {array.ndim - usual for kind, usual in (("video", 4), ("state", 2)) for array in groups[kind].values()}
+    if axes not in ({0}, {1}):
+        shapes = {name: array.shape for name, array in list((groups["video"] | groups["state"]).items())[:8]}
         raise InvalidObservation(f"observation: got {shapes}, want videos (B, T, H, W, 3) and states (B, T, D)")
     batched = axes == {1}
-    sizes = {array.shape[0] for group in (video, state) for array in group.values()} if batched else {1}
+    if not batched:
+        groups = {kind: {name: array[None] for name, array in group.items()} for kind, group in groups.items()}
+    arrays = [array for group in groups.values() for array in group.values()]
+    sizes = {array.shape[0] for array in arrays}
     if len(sizes) != 1 or not 0 < min(sizes) <= _BATCH:
         raise InvalidObservation(f"observation: got batches of {sorted(sizes)}, want the same, 1 to {_BATCH}, in all")
     number = sizes.pop()
     texts = _texts(named.get("language"), number)
-    if not batched:
-        video = {name: array[None] for name, array in video.items()}
-        state = {name: array[None] for name, array in state.items()}
-    if any(array.shape[1] == 0 for group in (video, state) for array in group.values()):
+    if any(array.shape[1] == 0 for array in arrays):
         raise InvalidObservation("observation: got no moment (T = 0), want one at least")
     each = tuple(
-        {
-            "video": {name: array[i] for name, array in video.items()},
-            "state": {name: array[i] for name, array in state.items()},
-            "language": {} if texts[i] is None else {TEXT_KEY: texts[i]},
-        }
+        {kind: {name: array[i] for name, array in group.items()} for kind, group in groups.items()}
+        | {"language": {} if texts[i] is None else {TEXT_KEY: texts[i]}}
         for i in range(number)
     )
     return Observations(each, batched, flat, paired)
@@ -140,7 +135,7 @@ def nested(flat: Mapping[str, Any]) -> dict[str, Any]:
     found: dict[str, Any] = {kind: {} for kind in _MODALITIES}
     for key, value in flat.items():
         kind, _, name = key.partition(".") if isinstance(key, str) else ("", "", "")
-        if kind in ("video", "state"):
+        if kind in _ARRAYS:
             found[kind][name] = value
         else:
             found["language"][key] = value
@@ -149,9 +144,8 @@ def nested(flat: Mapping[str, Any]) -> dict[str, Any]:
 
 def newest(observation: Mapping[str, Any]) -> dict[str, Any]:
     """Return an observation's last time step: {"video": {name: (H, W, 3)}, "state": {name: (D,)}, "language": ...}."""
-    return {kind: {name: array[-1] for name, array in observation[kind].items()} for kind in ("video", "state")} | {
-        "language": observation["language"]
-    }
+    arrays = {kind: {name: array[-1] for name, array in observation[kind].items()} for kind in _ARRAYS}
+    return arrays | {"language": observation["language"]}
 
 
 def write_actions(actions: Sequence[Mapping[str, np.ndarray]], asked: Observations, info: Mapping[str, Any]) -> Any:
@@ -304,7 +298,6 @@ PRESETS: dict[str, dict[str, Any]] = {
 # `msgpack_numpy`.
 
 _KEYS_AT_MOST = 64
-_ARRAYS = ("video", "state")
 _PACKED = "__ModalityConfig__"  # older servers write `__ModalityConfig_class__`
 
 
@@ -356,11 +349,9 @@ def read_actions(reply: Any, number: int) -> list[dict[str, np.ndarray]]:
     if not isinstance(actions, dict) or not actions:
         raise MalformedMessage(f"gr00t: got {type(actions).__name__} for an action, want a map of arrays")
     for name, array in actions.items():
-        if not isinstance(name, str) or not isinstance(array, np.ndarray) or array.ndim not in (2, 3):
-            got = f"{array.shape}" if isinstance(array, np.ndarray) else type(array).__name__
-            raise MalformedMessage(f"gr00t: action {shown(name)}: got {got}, want ({number}, H, D)")
-        if array.shape[0] != number:
-            raise MalformedMessage(f"gr00t: action {name[:40]!r}: got {array.shape}, want ({number}, H, D)")
+        is_array = isinstance(name, str) and isinstance(array, np.ndarray)
+        if not is_array or array.ndim not in (2, 3) or len(array) != number:
+            raise MalformedMessage(f"gr00t: action {shown(name)}: got {described(array)}, want ({number}, H, D)")
     return [
         {
             name.removeprefix("action."): array[i] if array.ndim == 3 else array[i][:, np.newaxis]
@@ -395,5 +386,6 @@ def _modality(name: str, value: Any) -> dict[str, list[Any]]:
         raise MalformedMessage(f"gr00t: modality {name[:40]!r}: want lists modality_keys and delta_indices")
     if not all(isinstance(key, str) for key in keys) or not all(type(step) is int for step in steps):
         raise MalformedMessage(f"gr00t: modality {name[:40]!r}: want texts and whole numbers in its lists")
-    shown = keys if name == "language" else [key.removeprefix(f"{name}.") for key in keys]
-    return {"keys": shown[:_KEYS_AT_MOST], "steps": steps}
+    if name != "language":
+        keys = [key.removeprefix(f"{name}.") for key in keys]
+    return {"keys": keys[:_KEYS_AT_MOST], "steps": steps}

@@ -47,8 +47,6 @@ class PolicyInstructions:
 
 @dataclass(frozen=True, slots=True)
 class RobotObservation:
-    """A client's observation."""
-
     timestamp: float  # the client's clock, s since 1970
     timestep: int  # number of the last action that the client executed
     values: Mapping[str, Any]  # numbers, texts and arrays by the robot's names

@@ -23,9 +23,10 @@ An observation is refused if the mapping reads nothing of it, or none of the cam
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import asdict, dataclass, field, fields
 from functools import lru_cache
+from itertools import islice
 from typing import Any, Literal, TypeVar
 
 import numpy as np
@@ -180,7 +181,7 @@ def lookup(nested: Mapping[Any, Any], path: str) -> Any:
 
 def keys(nested: Mapping[Any, Any]) -> list[str]:
     """Return the paths of all values that are not mappings, in order, at most 40, to be listed in an error."""
-    return [short_path(path) for path, _ in leaves(nested)]
+    return [short_path(path) for path, _ in islice(leaves(nested), _SHOWN)]
 
 
 def short_path(path: str) -> str:
@@ -188,18 +189,14 @@ def short_path(path: str) -> str:
     return "/".join(key[:_SHOWN] for key in path.split("/"))
 
 
-def leaves(nested: Mapping[Any, Any], prefix: str = "") -> list[tuple[str, Any]]:
-    """Return the paths and values of all values that are not mappings, in order, at most 40; see `short_path`."""
-    found: list[tuple[str, Any]] = []
+def leaves(nested: Mapping[Any, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
+    """Yield the paths and values of all values that are not mappings, in order; see `short_path`."""
     for key, value in nested.items():
-        if len(found) >= _SHOWN:
-            break
         path = f"{prefix}{(key if isinstance(key, str) else shown(key))[:_LONGEST]}"
         if isinstance(value, Mapping):
-            found += leaves(value, f"{path}/")
+            yield from leaves(value, f"{path}/")
         else:
-            found.append((path, value))
-    return found[:_SHOWN]
+            yield path, value
 
 
 def matches(name: str, pattern: str) -> bool:
@@ -243,9 +240,7 @@ def read_image(key: str, value: Any, layout: str, limits: Limits) -> np.ndarray:
     """Return an image as (H, W, 3) uint8 RGB; raise `InvalidObservation` or `MessageTooLarge`."""
     if isinstance(value, np.ndarray):
         value = _newest(key, value, 3)
-        if (
-            value.dtype.kind == "f"
-        ):  # converted as in openpi's own server (`_parse_image` in its policies): rounded down
+        if value.dtype.kind == "f":  # as in openpi's own server (`_parse_image` in its policies): rounded down
             if value.size and not (value.min() >= 0 and value.max() <= 1):  # also true for NaN
                 raise InvalidObservation(
                     f"camera {key!r}: got {value.dtype} from {value.min():g} to {value.max():g}, want uint8, or floats "
@@ -309,17 +304,9 @@ def _newest(key: str, value: np.ndarray, ndim: int) -> np.ndarray:
 
 
 def read_text(key: str, value: Any, texts: Mapping[str, str], limits: Limits, *, needed: bool) -> str | None:
-    """Return an instruction.
+    """Return an instruction: a text, a list or array of one text, or the one of `texts` for an array of one integer.
 
-    Args:
-        key: The client's key, for errors.
-        value: A text, a list or array of one text, or an array of one integer.
-        texts: The text for each integer.
-        needed: Whether an integer without a text is an error; if not, there is no instruction.
-
-    Raises:
-        InvalidObservation: `value` has another type, or is an integer without a text that is needed.
-        MessageTooLarge: The text is too long.
+    An integer without a text is an error if the instruction is `needed`; if not, there is no instruction.
     """
     while isinstance(value, (list, tuple)) and len(value) == 1:  # some clients send a batch of one
         value = value[0]
@@ -412,7 +399,11 @@ class KeyMapping:
         obs = Obs(cameras, gripper, state, info)
         if not cameras or not state:
             self._require_read(flat, obs)
-        return obs, self._instruction(flat, limits, needed=contract is not None and bool(contract.instruction))
+        text = None
+        if self.instruction is not None and (found := pick(flat, "", self.instruction, True, MissingState)):
+            needed = contract is not None and bool(contract.instruction)
+            text = read_text(self.instruction, found[0][2], self.instructions, limits, needed=needed)
+        return obs, text
 
     def rows(self, action: np.ndarray, spec: ActionSpec | None = None) -> np.ndarray:
         """Return our action, (D,) or (H, D), as (H, D) float32 with the gripper's commands in the client's convention.
@@ -485,7 +476,7 @@ class KeyMapping:
         patterns = [pattern for key in known for pattern in key.split("|")]
         return [
             short_path(path)
-            for path, value in leaves(flat)
+            for path, value in islice(leaves(flat), _SHOWN)
             if is_one(value) and not any(matches(path, pattern) for pattern in patterns)
         ]
 
@@ -503,9 +494,7 @@ class KeyMapping:
             ("cameras", images, obs.cameras, may_be_camera),
             ("state", numbers, obs.state, may_be_state),
         ):
-            if not wanted or found:
-                continue
-            if lost := self._unread(flat, is_one):
+            if wanted and not found and (lost := self._unread(flat, is_one)):
                 raise InvalidObservation(
                     f"observation: got {lost}, which the mapping does not read, and nothing at {wanted}; add them to "
                     f"mapping.{kind}, or to mapping.info if the policy does without"
@@ -534,12 +523,6 @@ class KeyMapping:
                 f"{gripper.open:g} (open); scale it, or change mapping.gripper"
             )
         return min(1.0, max(0.0, opening))
-
-    def _instruction(self, flat: Mapping[str, Any], limits: Limits, *, needed: bool) -> str | None:
-        found = [] if self.instruction is None else pick(flat, "", self.instruction, True, MissingState)
-        if not found or self.instruction is None:
-            return None
-        return read_text(self.instruction, found[0][2], self.instructions, limits, needed=needed)
 
 
 @lru_cache(maxsize=64)  # each message is logged once

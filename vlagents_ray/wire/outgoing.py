@@ -16,6 +16,7 @@ import numpy as np
 from vlagents_ray.contract import ActionSpec, CameraSpec, Contract, StateSpec
 from vlagents_ray.errors import ConfigError, InvalidAction, InvalidObservation, MissingCamera, MissingState
 from vlagents_ray.interface import Obs
+from vlagents_ray.validation import described
 from vlagents_ray.wire.mapping import KeyMapping, StateKey
 
 _MOST = 4096  # largest number of elements of a joined vector
@@ -68,12 +69,10 @@ class Outgoing:
             )
         if absent := [name for name in ranges if name not in named]:
             raise InvalidAction(f"action: got {sorted(named)[:16]}, which lacks {absent}; change mapping.action")
-        parts = {name: named[name] if named[name].ndim > 0 else named[name][None] for name in ranges}
-        heads = {part.shape[:-1] for part in parts.values()}
-        if len(heads) != 1:
-            shapes = {name: part.shape for name, part in parts.items()}
+        if len({named[name].shape[:-1] for name in ranges}) != 1:
+            shapes = {name: named[name].shape for name in ranges}
             raise InvalidAction(f"action: got {shapes}, want the same number of rows in all")
-        taken = {name: (one.start or 0, parts[name]) for name, one in ranges.items()}
+        taken = {name: (one.start or 0, named[name]) for name, one in ranges.items()}
         for name, (start, part) in taken.items():
             if (stop := ranges[name].stop) is not None and part.shape[-1] != stop - start:
                 raise InvalidAction(
@@ -211,6 +210,5 @@ def _joined(
 
 def _numbers(name: str, value: Any) -> np.ndarray:
     if not isinstance(value, np.ndarray) or value.dtype.kind not in "fiu" or not 0 < value.ndim <= 2:
-        shape = f"{value.shape} {value.dtype}" if isinstance(value, np.ndarray) else type(value).__name__
-        raise InvalidAction(f"{name!r}: got {shape}, want (D,) or (H, D) numbers")
+        raise InvalidAction(f"{name!r}: got {described(value)}, want (D,) or (H, D) numbers")
     return value.astype(np.float32)

@@ -55,8 +55,6 @@ Call = Callable[[tuple[Any, ...]], "Reduced | int | float"]
 
 
 class _StackValue(NamedTuple):
-    """A value on the stack."""
-
     value: Any
     depth: int = 0  # levels of containers in it
     items: int = 1  # values in it

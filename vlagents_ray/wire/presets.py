@@ -30,13 +30,11 @@ def read_mapping(
     Raises:
         ConfigError: The preset is unknown, or the object is invalid.
     """
-    if isinstance(value, str):
-        return KeyMapping.from_json(_found(value, preset))
-    if not isinstance(value, Mapping):
+    if not isinstance(value, (str, Mapping)):
         raise ConfigError(f"mapping: got {type(value).__name__}, want a preset's name or an object")
-    own = dict(value)
-    base = KeyMapping.from_json(_found(own.pop("preset"), preset)).to_json() if "preset" in own else {}
-    return KeyMapping.from_json(base | own)
+    own = {"preset": value} if isinstance(value, str) else dict(value)
+    base = _found(own.pop("preset"), preset) if "preset" in own else {}
+    return KeyMapping.from_json({**base, **own})
 
 
 def _found(name: object, preset: Callable[[str], Mapping[str, Any] | None]) -> Mapping[str, Any]:

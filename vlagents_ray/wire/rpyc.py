@@ -51,8 +51,6 @@ class Reference:
 
 @dataclass(frozen=True, slots=True)
 class RpycCall:
-    """A request of the peer."""
-
     sequence: int
     handler: Handler
     args: tuple[Any, ...]

@@ -63,8 +63,6 @@ class Part:
 
 @dataclass(frozen=True, slots=True)
 class ObservationRequest:
-    """A decoded observation."""
-
     obs: Obs
     instruction: str | None
     robots: tuple[str, ...]  # names in order; empty for vlagents 0.2, which has no names

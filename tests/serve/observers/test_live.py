@@ -19,10 +19,9 @@ from eval_fakes import Clock
 
 from vlagents_ray.errors import InvalidInput, MessageTooLarge, Overloaded, StorageFailed
 from vlagents_ray.images import jpeg_png
-from vlagents_ray.images.codecs import DecodedFiles
 from vlagents_ray.interface import Act, Obs
 from vlagents_ray.policies.noop import Noop
-from vlagents_ray.protocol.messages import Reply, Request
+from vlagents_ray.protocol.messages import DecodedFiles, Reply, Request
 from vlagents_ray.robot.dataset import Dataset
 from vlagents_ray.serve.config.deployment import LiveArgs
 from vlagents_ray.serve.engine.engine import Engine

@@ -26,11 +26,11 @@ SPIN_S = 150e-6  # s to poll for an answer before sleeping
 FAST_S = 600e-6  # s; after an answer within this time, wake-up included, the next one is polled for
 
 
-class RequestChannel(Protocol):
-    """Carries the requests of one frame at a time to one replica of a server.
+class Transport(Protocol):
+    """Carries the requests of one frame at a time to one replica of a server, which `connect` chooses.
 
     A request names its session, which ends with its `close` request, or with the connection. Errors that the server
-    replies with are in `Reply.error`.
+    replies with are in `Reply.error`. After `close`, `connect` may choose another replica.
 
     Raises:
         PolicyUnavailable: The server cannot be reached or is not ready.
@@ -46,18 +46,14 @@ class RequestChannel(Protocol):
     def name(self) -> str:
         """The name of the transport for users: "shm", "plasma", "websocket", "http" or "handle"."""
 
+    def connect(self, timeout_s: float) -> dict[str, Any]:
+        """Try once to reach the server; return its metadata."""
+
     def call(self, requests: Sequence[Request], timeout_s: float) -> list[Reply]:
         """Send requests as one frame and wait for their replies, in order. Nothing is ever sent twice."""
 
     def close(self) -> None:
         """End the connection."""
-
-
-class Transport(RequestChannel, Protocol):
-    """A channel that finds its replica itself; after `close`, `connect` may choose another replica."""
-
-    def connect(self, timeout_s: float) -> dict[str, Any]:
-        """Try once to reach the server; return its metadata."""
 
 
 class ConnectReport:

@@ -47,10 +47,7 @@ class HttpTransport:
     holds_sessions = False
 
     def __init__(self, url: str, codec: CodecChoice, credentials: Credentials = ANONYMOUS, machine: str = "") -> None:
-        """Set the server.
-
-        With `machine` (see `MACHINE_HEADER`), prefer the least loaded replica on that machine.
-        """
+        """Set the server; with `machine` (see `MACHINE_HEADER`), prefer the least loaded replica on that machine."""
         self._machine, self._credentials = machine, credentials
         self._url = http_url(url)
         self._codec = codec
@@ -205,7 +202,7 @@ def refusal(status: int, kind: str, body: bytes) -> VLAgentsError:
         )
     if status == 404:
         return UnknownApp(f"no application at this path ({text}); check the URL")
-    if status == 500 or status in (502, 503, 504):  # from the proxy: no replica is ready
+    if status in (500, 502, 503, 504):  # from the proxy: no replica is ready
         return NoReplica(f"no replica answers (HTTP {status}: {text})")
     return VLAgentsError(f"HTTP {status}: {text}")
 

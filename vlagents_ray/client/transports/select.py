@@ -7,8 +7,8 @@ from collections.abc import Sequence
 from typing import Any, Literal, get_args
 from urllib.parse import urlsplit
 
-from vlagents_ray.client.credentials import ANONYMOUS, Credentials
-from vlagents_ray.client.transports.base import CodecChoice, RequestChannel, Transport
+from vlagents_ray.client.credentials import Credentials
+from vlagents_ray.client.transports.base import CodecChoice, Transport
 from vlagents_ray.client.transports.http import HttpTransport, http_url
 from vlagents_ray.client.transports.serve_handle import HandleTransport, PlasmaTransport
 from vlagents_ray.client.transports.shm import ShmTransport, reaches
@@ -28,11 +28,9 @@ class AutoTransport:
     instead: its frames are in the store for a moment, or on disk if the store has no room for them.
     """
 
-    def __init__(
-        self, url: str, codec: CodecChoice, credentials: Credentials = ANONYMOUS, *, only_shm: bool = False
-    ) -> None:
+    def __init__(self, url: str, codec: CodecChoice, credentials: Credentials, *, only_shm: bool) -> None:
         self._credentials, self._url, self._codec, self._only_shm = credentials, url, codec, only_shm
-        self._chosen: RequestChannel | None = None
+        self._chosen: ShmTransport | PlasmaTransport | HandleTransport | WebSocketTransport | None = None
         self._handle: HandleTransport | None = None  # in addition to a channel to the same replica
 
     @property
@@ -66,8 +64,12 @@ class AutoTransport:
         if shm is not None:
             self._chosen = shm
         elif handle is not None:
-            channel = self._channel(handle, metadata, left_s)
-            self._chosen, self._handle = channel or handle, None if channel is None else handle
+            channel = PlasmaTransport(parts.netloc)
+            try:
+                channel.connect_to(handle, metadata, left_s)
+                self._chosen, self._handle = channel, handle
+            except (ConfigError, PolicyUnavailable):  # the replica is on another node
+                self._chosen, self._handle = handle, None
         else:
             stream = WebSocketTransport(self._url, self._codec, self._credentials)
             stream.connect_to(metadata, left_s)
@@ -75,7 +77,6 @@ class AutoTransport:
         return metadata
 
     def call(self, requests: Sequence[Request], timeout_s: float) -> list[Reply]:
-        """Send the requests by the chosen transport."""
         if self._chosen is None:
             raise NotReset("not connected; reset first")
         try:
@@ -93,14 +94,6 @@ class AutoTransport:
             self._chosen.close()
             self._chosen = self._handle = None
 
-    def _channel(self, handle: HandleTransport, metadata: dict[str, Any], timeout_s: float) -> PlasmaTransport | None:
-        transport = PlasmaTransport(urlsplit(self._url).netloc)
-        try:
-            transport.connect_to(handle, metadata, timeout_s)
-        except (ConfigError, PolicyUnavailable):  # the replica is on another node
-            return None
-        return transport
-
     def _shm(self, local: dict[str, Any] | None, timeout_s: float) -> ShmTransport | None:
         if not local or not reaches(local):
             if self._only_shm:
@@ -116,7 +109,7 @@ class AutoTransport:
         return transport
 
 
-def select_transport(url: str, transport: str, codec: CodecChoice, credentials: Credentials = ANONYMOUS) -> Transport:
+def select_transport(url: str, transport: str, codec: CodecChoice, credentials: Credentials) -> Transport:
     """Return the transport for a URL; raises `ConfigError` if the URL does not support it."""
     inside = urlsplit(url).scheme == "serve"
     if transport not in get_args(TransportName):

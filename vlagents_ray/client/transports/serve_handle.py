@@ -53,10 +53,7 @@ class HandleTransport:
     holds_sessions = False
 
     def __init__(self, app: str, *, must_be_near: bool = False) -> None:
-        """Set the application.
-
-        `must_be_near` accepts only a replica on this machine, even if others have far less load.
-        """
+        """Set the application; `must_be_near` accepts no other machine, even if replicas there have far less load."""
         self._must_be_near, self._app = must_be_near, app
         self._session = uuid.uuid4().hex
         self._replica: Any = None
@@ -147,7 +144,6 @@ class HandleTransport:
         return leased
 
     def close(self) -> None:
-        """Forget the replica."""
         self._replica = None
 
     def _lost(self, error: Exception) -> ConnectionLost:

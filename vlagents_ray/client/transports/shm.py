@@ -88,10 +88,7 @@ class UnixTransport(ABC):
         self._writer = shm_layout.ShmWriter()
 
     def _send(self, connection: socket.socket, requests: Sequence[Request], deadline: float) -> None:
-        """Write requests to memory that the server reads, and send the message.
-
-        Raises `TimeoutError` or `OSError` on failure.
-        """
+        """Write requests to memory that the server reads, and send the message; raises `TimeoutError` or `OSError`."""
         try:
             while not self._is_free():  # the memory still holds requests that timed out
                 try:
@@ -256,11 +253,9 @@ class ShmTransport(UnixTransport):
                 self._memories[memory.number] = _Memory(memory.number, mmap.mmap(-1, 1))
 
     def _answered(self, freed: int) -> None:
-        while freed:
-            number = freed.bit_length() - 1
-            freed -= 1 << number
-            if number < len(self._memories):
-                self._memories[number].busy = False
+        for memory in self._memories:
+            if freed >> memory.number & 1:
+                memory.busy = False
 
     def _memory(self, length: int) -> tuple[_Memory, int | None]:
         """Return free memory for `length` bytes, with its descriptor if the server has not received it yet."""

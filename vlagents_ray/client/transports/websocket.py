@@ -52,7 +52,7 @@ class ProxiedSocket:
 
     def __init__(self, url: str, credentials: Credentials, timeout_s: float) -> None:
         """Connect; raises the errors of `websockets`."""
-        self._open = contextlib.ExitStack()
+        self._open = contextlib.ExitStack()  # websockets 17.1 wants `connect` to be a context manager
         self._connection = self._open.enter_context(
             connect(
                 url,
@@ -241,9 +241,8 @@ class WebSocketTransport:
 
     def __init__(self, url: str, codec: CodecChoice, credentials: Credentials = ANONYMOUS) -> None:
         self._credentials = credentials
-        base = http_url(url)
+        self._base = base = http_url(url)
         scheme = "wss" if base.scheme == "https" else "ws"
-        self._base = base
         self._url = base._replace(scheme=scheme, path=base.path.rstrip("/") + "/v1/stream").geturl()
         self._codec = codec
         self._socket: ProxiedSocket | Stream | None = None
