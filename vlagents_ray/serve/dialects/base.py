@@ -68,9 +68,9 @@ from vlagents_ray.serve.access.api_keys import Identity, NoKey, caller_name, cur
 from vlagents_ray.serve.config.dialects import DialectArgs, DialectConfig, KeylessPortConfig, PortConfig, read_mapping
 from vlagents_ray.serve.endpoints.http_messages import (
     LONG_BYTES,
-    RequestDecoder,
     problem_response,
     public_problem,
+    read_body,
     request_id,
     session_id,
 )
@@ -445,7 +445,6 @@ class HttpDialect(RouteDialect):
 
     def __init__(self, name: str, config: DialectConfig, context: ReplicaContext) -> None:
         super().__init__(name, config, context)
-        self._requests = RequestDecoder(context.limits)
         # Sessions by caller and session id in the engine. A new key with the name of a revoked one continues the
         # sessions of that name, but not with the revoked key.
         self._kept: dict[tuple[Identity, str], ImplicitSession] = {}
@@ -467,7 +466,7 @@ class HttpDialect(RouteDialect):
         admission = self.gate(counted=True).admission(self.context.limits, rank=self.rank)
         try:
             self.context.engine.require_ready()
-            body = await self._requests.body(http, admission)
+            body = await read_body(http, admission)
             message.arrive()
             theirs = await decoded(read, body, admission)
             obs, instruction = self.read(theirs)
@@ -508,16 +507,12 @@ class HttpDialect(RouteDialect):
         known = (current_caller(), sender.session_id)
         if known not in self._kept or known[1] not in sessions:
             session = self.session(sender)
-            await self._fetch(known[1])
+            finder = self.context.engine.finder
+            if finder is not None and known[1] not in sessions:  # another replica has served it so far
+                over: asyncio.Future[None] = asyncio.get_running_loop().create_future()
+                if finder.fetch(known[1], partial(settle, over, None), caller_name()):
+                    await over
             if sessions.held([known[1]]):
                 session.episode.began(sessions.get(known[1]).instruction)
             self._kept[known] = session
         return self._kept[known]
-
-    async def _fetch(self, session_id: str) -> None:
-        """Fetch a session of a client that another replica has served so far, with its state."""
-        engine = self.context.engine
-        if engine.finder is not None and session_id not in engine.sessions:
-            over: asyncio.Future[None] = asyncio.get_running_loop().create_future()
-            if engine.finder.fetch(session_id, partial(settle, over, None), caller_name()):
-                await over
