@@ -400,8 +400,8 @@ class ScopeCheck:
     def __init__(self, subject: str, *, open_to_network: bool) -> None:
         self._subject, self._open_to_network = subject, open_to_network
 
-    def require(self, scope: str | None) -> None:
-        """Check the key of the current request, and its scope if one is given.
+    def require(self, scope: str) -> None:
+        """Check the key of the current request, and its scope.
 
         Raises:
             Unauthorized: The key is revoked or has expired.
@@ -411,10 +411,9 @@ class ScopeCheck:
         if isinstance(caller, Caller):
             caller.admit(free=True, scope=scope)
         elif self._open_to_network:
-            option = "" if scope is None else f" --scope {scope}"
             raise Forbidden(
                 f"{self._subject}: not on a server with `--insecure`; make a key with `vlagents-ray keys new "
-                f"NAME{option}` and serve with `--keys`, or serve on loopback without `--insecure`"
+                f"NAME --scope {scope}` and serve with `--keys`, or serve on loopback without `--insecure`"
             )
 
     def may(self, scope: str) -> bool:

@@ -37,7 +37,7 @@ import abc
 import asyncio
 import logging
 import socket
-from collections.abc import Awaitable, Callable, Mapping, Sequence
+from collections.abc import Awaitable, Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from typing import Any, ClassVar, NamedTuple, TypeVar
@@ -398,7 +398,7 @@ async def act_together(message: Message, seen: Sequence[SessionObs], request_id:
         repeated = await _ask(seen[0].session._sender.message(), "act", again, [None] * len(again), request_id)
         for i, reply in zip(forgotten, repeated, strict=True):
             replies[i] = reply
-    _raise_first(replies)
+    raise_first(reply.error for reply in replies)
     return replies
 
 
@@ -415,7 +415,7 @@ async def _reset(seen: Sequence[SessionObs], request_id: str) -> None:
     for one, opening, reply in zip(seen, openings, replies, strict=True):
         if reply.error is None:
             one.session.episode.began(opening)
-    _raise_first(replies)
+    raise_first(reply.error for reply in replies)
 
 
 async def _ask(
@@ -429,10 +429,11 @@ async def _ask(
     return await seen[0].session._sender.ask(message, Decoded(requests, {}))
 
 
-def _raise_first(replies: Sequence[Reply]) -> None:
-    for reply in replies:
-        if reply.error is not None:
-            raise reply.error
+def raise_first(results: Iterable[object]) -> None:
+    """Raise the first error among the results."""
+    for one in results:
+        if isinstance(one, Exception):
+            raise one
 
 
 class HttpDialect(RouteDialect):

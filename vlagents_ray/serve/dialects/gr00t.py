@@ -278,11 +278,8 @@ class GR00TDialect(PortDialect):
             context.destroy(linger=0)
 
     def _send(self, router: Any, zmq: Any) -> None:
-        while True:
-            try:
-                envelope, message = self._answers.get_nowait()
-            except queue.Empty:
-                return
+        while not self._answers.empty():  # no other thread takes from it
+            envelope, message = self._answers.get()
             with contextlib.suppress(zmq.ZMQError):  # the client is gone, or does not read
                 router.send_multipart([*envelope, message], zmq.NOBLOCK)
 
@@ -338,11 +335,8 @@ class _Strangers:
     def note_events(self) -> None:
         """Add the connections that ZeroMQ has accepted, and drop those that have ended."""
         parse = require("zmq.utils.monitor").parse_monitor_message
-        while True:
-            try:
-                event = parse(self.monitor.recv_multipart(self._zmq.NOBLOCK))
-            except self._zmq.Again:
-                return
+        while self.monitor.poll(0):
+            event = parse(self.monitor.recv_multipart())
             self._drop(event["value"])
             if event["event"] == self._zmq.EVENT_ACCEPTED:
                 self._add(event["value"])
