@@ -171,10 +171,6 @@ class RouteDialect(Dialect):
     root: ClassVar[str] = ""  # protocol at the server's root, if its clients connect there
     context: ReplicaContext
 
-    def __init__(self, name: str, config: DialectConfig, context: ReplicaContext) -> None:
-        super().__init__(name, config, context)
-        self.rank = config.rank
-
     @classmethod
     def places(cls, config: DialectConfig) -> dict[str, Any]:  # noqa: ARG003 - overrides
         return {"paths": list(cls.paths)}
@@ -208,7 +204,7 @@ class RouteDialect(Dialect):
 
     def session(self, sender: Sender, name: str = "") -> ImplicitSession:
         """Return a session of that sender, which begins without a reset by the client; by default its own session."""
-        return ImplicitSession(self.context.engine, sender, self.rank, name)
+        return ImplicitSession(self.context.engine, sender, self.config.rank, name)
 
     async def receive(self, socket: WebSocket, gate: Sender) -> tuple[bytes | None, MessageAdmission] | None:
         """Wait for the next message of a WebSocket, and before that until the key of its `gate` is within its rate.
@@ -220,11 +216,11 @@ class RouteDialect(Dialect):
         if event["type"] == "websocket.disconnect":
             return None
         data = event.get("bytes")
-        return data, gate.admission(self.context.limits, 0 if data is None else len(data), self.rank)
+        return data, gate.admission(self.context.limits, 0 if data is None else len(data), self.config.rank)
 
     def arrived(self) -> Message:
         """Create the `Message` of an observation that has just arrived."""
-        return Message(self.context.engine.stats, self.name, "act", self.rank)
+        return Message(self.context.engine.stats, self.name, "act", self.config.rank)
 
 
 class PortDialect(Dialect):
@@ -353,11 +349,9 @@ class ImplicitSession:
     Its name is unique in the replica, or empty for the sender's own session.
     """
 
-    def __init__(self, engine: Engine, sender: Sender, rank: RankName = "robot", name: str = "") -> None:
+    def __init__(self, engine: Engine, sender: Sender, rank: RankName, name: str) -> None:
         self.episode = ImplicitEpisode()
-        self._engine, self._sender = engine, sender
-        self._rank: RankName = rank
-        self._name = name
+        self._engine, self._sender, self._rank, self._name = engine, sender, rank, name
 
     async def act(self, message: Message, obs: Obs, instruction: str | None, request_id: str) -> Reply:
         """Return the policy's reply to an observation; see `act_together`."""
@@ -464,7 +458,7 @@ class HttpDialect(RouteDialect):
         """
         name = request_id(http)
         message = self.arrived()
-        admission = self.gate(counted=True).admission(self.context.limits, rank=self.rank)
+        admission = self.gate(counted=True).admission(self.context.limits, rank=self.config.rank)
         try:
             self.context.engine.require_ready()
             body = await read_body(http, admission)

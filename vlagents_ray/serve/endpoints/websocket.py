@@ -367,7 +367,7 @@ class WebSocketConnection(PolledConnection):
 
     def _continue(self) -> None:
         self._process_frames()
-        self._poll()
+        super()._continue()
 
     def _process(self, frame: Frame, arrived: float, admission: MessageAdmission | None) -> None:
         if self._sender is None:  # no frame is read before the handshake is accepted
