@@ -24,7 +24,6 @@ from typing import ClassVar
 
 from websockets.frames import Frame, Opcode
 from websockets.http11 import Request as Handshake
-from websockets.http11 import Response
 from websockets.protocol import State
 from websockets.server import ServerProtocol
 
@@ -314,7 +313,15 @@ class WebSocketConnection(PolledConnection):
             self._protocol.receive_data(head)
             events = self._protocol.events_received()
         if len(events) == 1 and isinstance(events[0], Handshake):
-            response = self._handshake_response(events[0])
+            try:
+                self.caller = self._server.identify(self, events[0])
+                response = self._protocol.accept(events[0])
+            except VLAgentsError as refused:
+                response = self._protocol.reject(refused.status, f"{refused}\n")
+                if isinstance(refused, TooManyRequests | PolicyUnavailable):
+                    response.headers["Retry-After"] = "1"
+                if isinstance(refused, TooManyRequests):
+                    self._refused_for_s = refused.retry_after_s
             with self._sending:
                 self._protocol.send_response(response)
         if self._protocol.state is not State.OPEN or self.caller is None:
@@ -339,18 +346,6 @@ class WebSocketConnection(PolledConnection):
             self._poller.call_later(min(self._refused_for_s, _REFUSED_S), refuse)
         else:
             refuse()
-
-    def _handshake_response(self, request: Handshake) -> Response:
-        try:
-            self.caller = self._server.identify(self, request)
-            return self._protocol.accept(request)
-        except VLAgentsError as refused:
-            response = self._protocol.reject(refused.status, f"{refused}\n")
-            if isinstance(refused, TooManyRequests | PolicyUnavailable):
-                response.headers["Retry-After"] = "1"
-            if isinstance(refused, TooManyRequests):
-                self._refused_for_s = refused.retry_after_s
-            return response
 
     def _process_frames(self) -> None:
         """Process the received frames in order, until one of them has to wait."""
