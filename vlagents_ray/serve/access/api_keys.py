@@ -386,9 +386,6 @@ def warn_of_plain_http(host: str) -> None:
         )
 
 
-# Checks of the scopes of a request's key.
-
-
 @dataclass(frozen=True, slots=True)
 class ScopeCheck:
     """The check of the keys and scopes of requests to one endpoint."""
