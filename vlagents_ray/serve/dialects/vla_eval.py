@@ -187,17 +187,19 @@ class _Inbox:
                     self.end = f"{_WAITING} messages wait for answers; send no more than that at once"
                     self._put(_Received(MessageTooLarge(self.end), admission))
                     return
-                message: vla_eval.Message | VLAgentsError
-                try:  # decoding a message counts as a request of the key
-                    message = await base.decoded(
-                        lambda data, budget: vla_eval.decode(data, budget.limits), data, admission
-                    )
-                except Exception as error:  # noqa: BLE001 - the error is the reply to the client
-                    message = public_problem(error, "vla_eval", "of an unreadable message")
-                self._put(_Received(message, admission))
+                self._put(await self._read(data, admission))
             self.end = REFUSED
         finally:
             self._put(None)
+
+    @staticmethod
+    async def _read(data: bytes | None, admission: MessageAdmission) -> _Received:
+        """Decode a message, which counts as a request of the key."""
+        try:
+            message = await base.decoded(lambda data, budget: vla_eval.decode(data, budget.limits), data, admission)
+            return _Received(message, admission)
+        except Exception as error:  # noqa: BLE001 - the error is the reply to the client
+            return _Received(public_problem(error, "vla_eval", "of an unreadable message"), admission)
 
     def _put(self, received: _Received | None) -> None:
         last = self._messages[-1] if self._messages else None

@@ -61,16 +61,8 @@ class VlagentsConnection:
         try:
             self._connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
             while (frame := self._receive()) is not None:
-                try:
-                    call = rpyc.read_call(*frame, self._context.limits.body_bytes)
-                except rpyc.Refused as refused:
-                    self._send(rpyc.exception(refused.sequence, "AttributeError", str(refused)))
-                    continue
-                if call is None:
-                    continue
-                if call.handler is Handler.CLOSE:
+                if not self._handle(*frame):
                     return
-                self._send(self._answer(call))
         except (InvalidInput, OSError, ValueError) as error:
             logger.info("vlagents: disconnected a client: %s", error)
         except Exception:
@@ -80,6 +72,20 @@ class VlagentsConnection:
             self._connection.close()
             self._segments.close()
             self._session.close()
+
+    def _handle(self, body: bytearray, compressed: bool) -> bool:
+        """Process one message; return False if the client closes the connection."""
+        try:
+            call = rpyc.read_call(body, compressed, self._context.limits.body_bytes)
+        except rpyc.Refused as refused:
+            self._send(rpyc.exception(refused.sequence, "AttributeError", str(refused)))
+            return True
+        if call is None:
+            return True
+        if call.handler is Handler.CLOSE:
+            return False
+        self._send(self._answer(call))
+        return True
 
     def _answer(self, call: RpycCall) -> bytes:
         try:
