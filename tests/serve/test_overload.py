@@ -754,7 +754,7 @@ def test_requests_that_wait_at_groots_gateway_count_as_in_flight() -> None:
     answers.get(timeout=10)
     assert admission.held == 0
     client.end()
-    client.join(10)
+    client.thread.join(10)
     dialect.close()
 
 

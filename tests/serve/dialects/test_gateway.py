@@ -40,7 +40,7 @@ def test_a_gateway_serves_each_dialect_on_its_port_and_is_healthy_while_all_are(
 ) -> None:
     monkeypatch.setattr(module.serve, "get_replica_context", lambda: SimpleNamespace(app_name="noop"))
     monkeypatch.setattr(module, "wait_for_policy", lambda _app: None)
-    monkeypatch.setattr(module, "_connector", lambda *_, **_options: lambda *_: replicas.agent())
+    monkeypatch.setattr(module, "_connect", lambda *_: replicas.agent())
     ports = {"vlagents": free_port(), "gr00t": free_port()}
     stated = {name: {"port": port} for name, port in ports.items()} | {"openvla": {}}
     args = ServerArgs(policy="noop", dialects=stated)

@@ -7,37 +7,40 @@ import resource
 import socket
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
+from typing import Any, cast
 
 import pytest
 
-from vlagents_ray.serve.endpoints.connection import Acceptor
+from vlagents_ray.protocol.messages import Limits
+from vlagents_ray.serve.access.api_keys import NoKey
+from vlagents_ray.serve.endpoints.connection import PolledServer
 
 
-class Endpoint:
+class Endpoint(PolledServer[Any]):
     """Keeps who comes, or refuses to."""
 
     def __init__(self) -> None:
-        self.listener = socket.create_server(("127.0.0.1", 0))
-        self.listener.settimeout(5)
+        listener = socket.create_server(("127.0.0.1", 0))
+        listener.settimeout(5)
+        super().__init__(cast(Any, None), Limits(), NoKey.OPEN, listener)
         self.clients: list[socket.socket] = []
         self.broken = False
-        self.acceptor = Acceptor(self.listener, self.on_connection)
 
-    def on_connection(self, connection: socket.socket) -> None:
+    def _add_client(self, connection: socket.socket) -> None:
         if self.broken:
             raise OSError
         self.clients.append(connection)
 
     def connect(self) -> socket.socket:
-        return socket.create_connection(self.listener.getsockname(), 5)
+        return socket.create_connection(self._listener.getsockname(), 5)
 
 
 @pytest.fixture
 def endpoint() -> Iterator[Endpoint]:
     endpoint = Endpoint()
     yield endpoint
-    endpoint.acceptor.close()
-    for each in (endpoint.listener, *endpoint.clients):
+    endpoint.close()
+    for each in endpoint.clients:
         each.close()
 
 
@@ -63,19 +66,19 @@ def test_who_comes_when_no_descriptor_is_left_is_turned_away_and_the_next_let_in
     for _ in range(2):
         with endpoint.connect() as refused:
             with no_descriptors_left():
-                endpoint.acceptor.accept()
+                endpoint.accept()
             assert refused.recv(1) == b""
     with endpoint.connect():
-        endpoint.acceptor.accept()
+        endpoint.accept()
     assert len(endpoint.clients) == 1
 
 
 def test_whom_the_endpoint_cannot_take_is_turned_away_and_the_next_let_in(endpoint: Endpoint) -> None:
     endpoint.broken = True
     with endpoint.connect() as refused:
-        endpoint.acceptor.accept()
+        endpoint.accept()
         assert refused.recv(1) == b""
     endpoint.broken = False
     with endpoint.connect():
-        endpoint.acceptor.accept()
+        endpoint.accept()
     assert len(endpoint.clients) == 1

@@ -50,12 +50,9 @@ def test_pictures_go_to_those_who_show_them(own: ReplicaView) -> None:
 
     async def watch() -> list[tuple[dict[str, Any], list[bytes]]]:
         gathered = Fleet(own, others)
-        one, two = gathered.add(), gathered.add()
-        one.shown, two.shown = frozenset({"of c"}), frozenset({"of b", "of c"})
-        seen = [await one.next(), await two.next()]
-        gathered.remove(one)
-        gathered.remove(two)
-        return seen
+        with gathered.viewer() as one, gathered.viewer() as two:
+            one.shown, two.shown = frozenset({"of c"}), frozenset({"of b", "of c"})
+            return [await one.next(), await two.next()]
 
     (first, its_files), (second, their_files) = asyncio.run(watch())
     assert [one["name"] for one in first["replicas"]] == ["b", "c", "own"]
@@ -80,12 +77,11 @@ def test_a_replica_that_does_not_answer_is_left_out_and_asked_again_from_where_i
 
     async def watch() -> None:
         gathered = Fleet(own, others)
-        viewer = gathered.add()
-        for failing, names in (((), {"b", "own"}), ({"b"}, {"own"}), ((), {"b", "own"})):
-            others.failing = set(failing)
-            while {one["name"] for one in (await viewer.next())[0]["replicas"]} != names:
-                pass
-        gathered.remove(viewer)
+        with gathered.viewer() as viewer:
+            for failing, names in (((), {"b", "own"}), ({"b"}, {"own"}), ((), {"b", "own"})):
+                others.failing = set(failing)
+                while {one["name"] for one in (await viewer.next())[0]["replicas"]} != names:
+                    pass
 
     asyncio.run(asyncio.wait_for(watch(), 30))
     since = [number for _, number, _ in others.asked]
@@ -98,9 +94,8 @@ def test_nothing_is_gathered_without_viewers(own: ReplicaView) -> None:
 
     async def watch() -> int:
         gathered = Fleet(own, others)
-        viewer = gathered.add()
-        await viewer.next()
-        gathered.remove(viewer)
+        with gathered.viewer() as viewer:
+            await viewer.next()
         asked = len(others.asked)
         await asyncio.sleep(0.3)
         assert len(others.asked) == asked
@@ -121,9 +116,8 @@ def test_an_error_of_a_reading_does_not_end_the_next(own: ReplicaView, monkeypat
 
     async def watch() -> dict[str, Any]:
         gathered = Fleet(own)
-        viewer = gathered.add()
-        document, _ = await viewer.next()
-        gathered.remove(viewer)
+        with gathered.viewer() as viewer:
+            document, _ = await viewer.next()
         return document
 
     assert asyncio.run(watch())["replicas"][0]["name"] == "own"
@@ -134,12 +128,11 @@ def test_what_is_beside_the_replicas_is_sent_when_it_has_changed() -> None:
 
     async def watch() -> list[dict[str, Any]]:
         gathered = Fleet(None, more=lambda: said[-1])
-        viewer = gathered.add()
-        found = [(await viewer.next())[0] for _ in range(2)]
-        said.append({"evaluation": {"done": 2}})
-        while "evaluation" not in (last := (await viewer.next())[0]):
-            pass
-        gathered.remove(viewer)
+        with gathered.viewer() as viewer:
+            found = [(await viewer.next())[0] for _ in range(2)]
+            said.append({"evaluation": {"done": 2}})
+            while "evaluation" not in (last := (await viewer.next())[0]):
+                pass
         return [*found, last]
 
     first, second, last = asyncio.run(watch())

@@ -386,22 +386,15 @@ def warn_of_plain_http(host: str) -> None:
         )
 
 
-# Checks of the scopes of a request's key.
-
-
+@dataclass(frozen=True, slots=True)
 class ScopeCheck:
-    """The check of the keys and scopes of requests to one endpoint.
+    """The check of the keys and scopes of requests to one endpoint."""
 
-    Args:
-        subject: The subject of the endpoint, for the error message.
-        open_to_network: Whether other machines reach this server without a key; requests are then refused.
-    """
+    subject: str  # the subject of the endpoint, for the error message
+    open_to_network: bool  # whether other machines reach this server without a key; requests are then refused
 
-    def __init__(self, subject: str, *, open_to_network: bool) -> None:
-        self._subject, self._open_to_network = subject, open_to_network
-
-    def require(self, scope: str | None) -> None:
-        """Check the key of the current request, and its scope if one is given.
+    def require(self, scope: str) -> None:
+        """Check the key of the current request, and its scope.
 
         Raises:
             Unauthorized: The key is revoked or has expired.
@@ -410,17 +403,16 @@ class ScopeCheck:
         caller = current_caller()
         if isinstance(caller, Caller):
             caller.admit(free=True, scope=scope)
-        elif self._open_to_network:
-            option = "" if scope is None else f" --scope {scope}"
+        elif self.open_to_network:
             raise Forbidden(
-                f"{self._subject}: not on a server with `--insecure`; make a key with `vlagents-ray keys new "
-                f"NAME{option}` and serve with `--keys`, or serve on loopback without `--insecure`"
+                f"{self.subject}: not on a server with `--insecure`; make a key with `vlagents-ray keys new "
+                f"NAME --scope {scope}` and serve with `--keys`, or serve on loopback without `--insecure`"
             )
 
     def may(self, scope: str) -> bool:
         """Return whether the current request has the scope, as `require` checks it."""
         caller = current_caller()
-        return caller.refusal(scope) is None if isinstance(caller, Caller) else not self._open_to_network
+        return caller.refusal(scope) is None if isinstance(caller, Caller) else not self.open_to_network
 
 
 def caller_name() -> str:

@@ -37,7 +37,7 @@ import abc
 import asyncio
 import logging
 import socket
-from collections.abc import Awaitable, Callable, Mapping, Sequence
+from collections.abc import Awaitable, Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from typing import Any, ClassVar, NamedTuple, TypeVar
@@ -68,9 +68,9 @@ from vlagents_ray.serve.access.api_keys import Identity, NoKey, caller_name, cur
 from vlagents_ray.serve.config.dialects import DialectArgs, DialectConfig, KeylessPortConfig, PortConfig, read_mapping
 from vlagents_ray.serve.endpoints.http_messages import (
     LONG_BYTES,
-    RequestDecoder,
     problem_response,
     public_problem,
+    read_body,
     request_id,
     session_id,
 )
@@ -171,10 +171,6 @@ class RouteDialect(Dialect):
     root: ClassVar[str] = ""  # protocol at the server's root, if its clients connect there
     context: ReplicaContext
 
-    def __init__(self, name: str, config: DialectConfig, context: ReplicaContext) -> None:
-        super().__init__(name, config, context)
-        self.rank = config.rank
-
     @classmethod
     def places(cls, config: DialectConfig) -> dict[str, Any]:  # noqa: ARG003 - overrides
         return {"paths": list(cls.paths)}
@@ -208,7 +204,7 @@ class RouteDialect(Dialect):
 
     def session(self, sender: Sender, name: str = "") -> ImplicitSession:
         """Return a session of that sender, which begins without a reset by the client; by default its own session."""
-        return ImplicitSession(self.context.engine, sender, self.rank, name)
+        return ImplicitSession(self.context.engine, sender, self.config.rank, name)
 
     async def receive(self, socket: WebSocket, gate: Sender) -> tuple[bytes | None, MessageAdmission] | None:
         """Wait for the next message of a WebSocket, and before that until the key of its `gate` is within its rate.
@@ -220,11 +216,11 @@ class RouteDialect(Dialect):
         if event["type"] == "websocket.disconnect":
             return None
         data = event.get("bytes")
-        return data, gate.admission(self.context.limits, 0 if data is None else len(data), self.rank)
+        return data, gate.admission(self.context.limits, 0 if data is None else len(data), self.config.rank)
 
     def arrived(self) -> Message:
         """Create the `Message` of an observation that has just arrived."""
-        return Message(self.context.engine.stats, self.name, "act", self.rank)
+        return Message(self.context.engine.stats, self.name, "act", self.config.rank)
 
 
 class PortDialect(Dialect):
@@ -353,11 +349,9 @@ class ImplicitSession:
     Its name is unique in the replica, or empty for the sender's own session.
     """
 
-    def __init__(self, engine: Engine, sender: Sender, rank: RankName = "robot", name: str = "") -> None:
+    def __init__(self, engine: Engine, sender: Sender, rank: RankName, name: str) -> None:
         self.episode = ImplicitEpisode()
-        self._engine, self._sender = engine, sender
-        self._rank: RankName = rank
-        self._name = name
+        self._engine, self._sender, self._rank, self._name = engine, sender, rank, name
 
     async def act(self, message: Message, obs: Obs, instruction: str | None, request_id: str) -> Reply:
         """Return the policy's reply to an observation; see `act_together`."""
@@ -398,7 +392,7 @@ async def act_together(message: Message, seen: Sequence[SessionObs], request_id:
         repeated = await _ask(seen[0].session._sender.message(), "act", again, [None] * len(again), request_id)
         for i, reply in zip(forgotten, repeated, strict=True):
             replies[i] = reply
-    _raise_first(replies)
+    raise_first(reply.error for reply in replies)
     return replies
 
 
@@ -415,7 +409,7 @@ async def _reset(seen: Sequence[SessionObs], request_id: str) -> None:
     for one, opening, reply in zip(seen, openings, replies, strict=True):
         if reply.error is None:
             one.session.episode.began(opening)
-    _raise_first(replies)
+    raise_first(reply.error for reply in replies)
 
 
 async def _ask(
@@ -429,10 +423,11 @@ async def _ask(
     return await seen[0].session._sender.ask(message, Decoded(requests, {}))
 
 
-def _raise_first(replies: Sequence[Reply]) -> None:
-    for reply in replies:
-        if reply.error is not None:
-            raise reply.error
+def raise_first(results: Iterable[object]) -> None:
+    """Raise the first error among the results."""
+    for one in results:
+        if isinstance(one, Exception):
+            raise one
 
 
 class HttpDialect(RouteDialect):
@@ -445,7 +440,6 @@ class HttpDialect(RouteDialect):
 
     def __init__(self, name: str, config: DialectConfig, context: ReplicaContext) -> None:
         super().__init__(name, config, context)
-        self._requests = RequestDecoder(context.limits)
         # Sessions by caller and session id in the engine. A new key with the name of a revoked one continues the
         # sessions of that name, but not with the revoked key.
         self._kept: dict[tuple[Identity, str], ImplicitSession] = {}
@@ -464,10 +458,10 @@ class HttpDialect(RouteDialect):
         """
         name = request_id(http)
         message = self.arrived()
-        admission = self.gate(counted=True).admission(self.context.limits, rank=self.rank)
+        admission = self.gate(counted=True).admission(self.context.limits, rank=self.config.rank)
         try:
             self.context.engine.require_ready()
-            body = await self._requests.body(http, admission)
+            body = await read_body(http, admission)
             message.arrive()
             theirs = await decoded(read, body, admission)
             obs, instruction = self.read(theirs)
@@ -508,16 +502,12 @@ class HttpDialect(RouteDialect):
         known = (current_caller(), sender.session_id)
         if known not in self._kept or known[1] not in sessions:
             session = self.session(sender)
-            await self._fetch(known[1])
+            finder = self.context.engine.finder
+            if finder is not None and known[1] not in sessions:  # another replica has served it so far
+                over: asyncio.Future[None] = asyncio.get_running_loop().create_future()
+                if finder.fetch(known[1], partial(settle, over, None), caller_name()):
+                    await over
             if sessions.held([known[1]]):
                 session.episode.began(sessions.get(known[1]).instruction)
             self._kept[known] = session
         return self._kept[known]
-
-    async def _fetch(self, session_id: str) -> None:
-        """Fetch a session of a client that another replica has served so far, with its state."""
-        engine = self.context.engine
-        if engine.finder is not None and session_id not in engine.sessions:
-            over: asyncio.Future[None] = asyncio.get_running_loop().create_future()
-            if engine.finder.fetch(session_id, partial(settle, over, None), caller_name()):
-                await over

@@ -16,7 +16,7 @@ from vlagents_ray.registry import dialect_class
 from vlagents_ray.serve.access.api_keys import NoKey, require_access
 from vlagents_ray.serve.access.audit import write_audit
 from vlagents_ray.serve.config.deployment import ServerArgs
-from vlagents_ray.serve.dialects.base import Connect, GatewayContext, PortDialect
+from vlagents_ray.serve.dialects.base import GatewayContext, PortDialect
 from vlagents_ray.serve.engine.admission import Admission
 from vlagents_ray.serve.ports import LOOPBACK, reserve
 
@@ -49,7 +49,7 @@ class Gateway:
             for name, one in wanted.items():
                 context = GatewayContext(
                     app=app,
-                    connect=_connector(app, one.rank, keyed=keys is not None),
+                    connect=partial(_connect, app, one.rank, keys is not None),
                     limits=limits,
                     sessions=args.sessions.limit,
                     idle_s=args.sessions.idle_s,
@@ -85,18 +85,14 @@ def wait_for_policy(app: str) -> Contract | None:
         return agent.contract
 
 
-def _connector(app: str, rank: RankName, *, keyed: bool) -> Connect:
-    def connect(key: str | None, allowed: RankName | None) -> RemoteAgent:
-        # The gateway itself enforces the permissions of the key, in `GatewaySessions`, as not every transport to a
-        # replica contains the key. Shared memory of a replica requires a key, which some clients lack; the handle does
-        # not.
-        return RemoteAgent(
-            f"serve://{app}",
-            transport="handle" if keyed and key is None else "auto",
-            rank=allowed or rank,
-            timeout_s=_ANSWER_S,
-            connect_timeout_s=_ANSWER_S,
-            api_key=key,
-        )
-
-    return connect
+def _connect(app: str, rank: RankName, keyed: bool, key: str | None, allowed: RankName | None) -> RemoteAgent:
+    # The gateway itself enforces the permissions of the key, in `GatewaySessions`, as not every transport to a replica
+    # contains the key. Shared memory of a replica requires a key, which some clients lack; the handle does not.
+    return RemoteAgent(
+        f"serve://{app}",
+        transport="handle" if keyed and key is None else "auto",
+        rank=allowed or rank,
+        timeout_s=_ANSWER_S,
+        connect_timeout_s=_ANSWER_S,
+        api_key=key,
+    )

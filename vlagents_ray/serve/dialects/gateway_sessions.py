@@ -21,7 +21,7 @@ from vlagents_ray.errors import PolicyUnavailable
 from vlagents_ray.interface import Act, Obs
 from vlagents_ray.protocol.messages import RankName
 from vlagents_ray.serve.access.api_keys import Caller, Identity
-from vlagents_ray.serve.dialects.base import Connect, GatewayContext, ImplicitEpisode
+from vlagents_ray.serve.dialects.base import Connect, GatewayContext, ImplicitEpisode, raise_first
 
 logger = logging.getLogger(__name__)
 
@@ -86,11 +86,11 @@ class GatewaySessions:
             infos = agents[0].reset_batch(
                 [obs[i] for i in fresh], [texts[i] for i in fresh], [agents[i] for i in fresh]
             )
-            _raise_first(infos)
+            raise_first(infos)
         acts = agents[0].act_batch(obs, agents)
         for episode, text in zip(self._episodes, texts, strict=True):
             episode.began(text)
-        _raise_first(acts)
+        raise_first(acts)
         return [act for act in acts if isinstance(act, Act)]
 
     def show(self, caller: Identity, key: str | None) -> None:
@@ -162,12 +162,6 @@ def internal_error(dialect: str) -> str:
     name = uuid.uuid4().hex
     logger.exception("%s: request %s failed", dialect, name)
     return f"internal error; the server's log has the details under {name}"
-
-
-def _raise_first(found: Sequence[object]) -> None:
-    for one in found:
-        if isinstance(one, Exception):
-            raise one
 
 
 # Clients of a dialect whose protocol has no message for their end.

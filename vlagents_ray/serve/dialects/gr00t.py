@@ -54,8 +54,8 @@ class GR00TConnection(GatewayClient):
         self._send = answer
         self._requests: queue.SimpleQueue[bytes | None] = queue.SimpleQueue()
         self._lock = threading.Lock()
-        self._thread = threading.Thread(target=self._run, name="gr00t-client", daemon=True)
-        self._thread.start()
+        self.thread = threading.Thread(target=self._run, name="gr00t-client", daemon=True)
+        self.thread.start()
 
     def put(self, payload: bytes) -> bool:
         """Queue a request; return False if too many are waiting.
@@ -73,10 +73,6 @@ class GR00TConnection(GatewayClient):
 
     def end(self) -> None:
         self._requests.put(None)
-
-    def join(self, timeout_s: float) -> None:
-        """Wait until the thread has ended."""
-        self._thread.join(timeout_s)
 
     def _run(self) -> None:
         while (payload := self._requests.get()) is not None:
@@ -211,7 +207,7 @@ class GR00TDialect(PortDialect):
         if self._thread is not None:
             self._thread.join(_END_S)
         for client in self._clients.end_all():
-            client.join(_END_S)
+            client.thread.join(_END_S)
         self._bell.close()
         self._ring.close()
 
@@ -278,11 +274,8 @@ class GR00TDialect(PortDialect):
             context.destroy(linger=0)
 
     def _send(self, router: Any, zmq: Any) -> None:
-        while True:
-            try:
-                envelope, message = self._answers.get_nowait()
-            except queue.Empty:
-                return
+        while not self._answers.empty():  # no other thread takes from it
+            envelope, message = self._answers.get()
             with contextlib.suppress(zmq.ZMQError):  # the client is gone, or does not read
                 router.send_multipart([*envelope, message], zmq.NOBLOCK)
 
@@ -338,11 +331,8 @@ class _Strangers:
     def note_events(self) -> None:
         """Add the connections that ZeroMQ has accepted, and drop those that have ended."""
         parse = require("zmq.utils.monitor").parse_monitor_message
-        while True:
-            try:
-                event = parse(self.monitor.recv_multipart(self._zmq.NOBLOCK))
-            except self._zmq.Again:
-                return
+        while self.monitor.poll(0):
+            event = parse(self.monitor.recv_multipart())
             self._drop(event["value"])
             if event["event"] == self._zmq.EVENT_ACCEPTED:
                 self._add(event["value"])

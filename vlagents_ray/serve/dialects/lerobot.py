@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import contextlib
 import logging
 import socket
 import threading
 import time
 from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass
 from functools import partial
 from typing import Any, ClassVar
@@ -66,6 +65,7 @@ class _Waiting:
     """An observation that the policy has not received yet."""
 
     seen: RobotObservation
+    robot: PolicyInstructions
     obs: Obs
     instruction: str | None
     admission: MessageAdmission
@@ -86,12 +86,12 @@ class LeRobotConnection(GatewayClient):
         self._ended = False
 
     @contextmanager
-    def request(self) -> Iterator[None]:
-        """Count a request as unanswered within the context."""
+    def request(self) -> Iterator[LeRobotConnection]:
+        """Count a request as unanswered within the context, and yield the client."""
         with self._arrival:
             self._unanswered += 1
         try:
-            yield
+            yield self
         finally:
             with self._arrival:
                 self._unanswered -= 1
@@ -124,7 +124,7 @@ class LeRobotConnection(GatewayClient):
         if not self.sessions.begun:
             self._mapping.warn_of_unread_cameras(theirs, "lerobot")
         with self._arrival:
-            earlier, self._waiting = self._waiting, _Waiting(seen, obs, instruction, admission)
+            earlier, self._waiting = self._waiting, _Waiting(seen, self._robot, obs, instruction, admission)
             self._arrival.notify()
         if earlier is not None:
             earlier.admission.release()
@@ -135,8 +135,10 @@ class LeRobotConnection(GatewayClient):
         if not self._acting.acquire(timeout=_WAIT_S):
             return None
         try:
-            waiting = self._next(deadline)
-            return None if waiting is None else self._act(waiting)
+            with self._arrival:
+                self._arrival.wait_for(lambda: self._waiting or self._ended, deadline - time.monotonic())
+                waiting, self._waiting = self._waiting, None
+            return None if waiting is None or self._ended else self._act(waiting)
         finally:
             self._acting.release()
             if self._ended:
@@ -155,16 +157,8 @@ class LeRobotConnection(GatewayClient):
             finally:
                 self._acting.release()
 
-    def _next(self, deadline: float) -> _Waiting | None:
-        with self._arrival:
-            self._arrival.wait_for(lambda: self._waiting or self._ended, deadline - time.monotonic())
-            waiting, self._waiting = self._waiting, None
-        return None if self._ended else waiting
-
     def _act(self, waiting: _Waiting) -> bytes:
-        robot, contract, seen = self._robot, self._context.contract, waiting.seen
-        if robot is None:
-            raise NotReset("SendPolicyInstructions: got none since Ready; start the client again")
+        contract, seen = self._context.contract, waiting.seen
         before, self._acted = self._acted, max(self._acted, seen.timestep)
         try:
             act = self.sessions.act(waiting.obs, waiting.instruction)
@@ -175,7 +169,7 @@ class LeRobotConnection(GatewayClient):
             waiting.admission.release()
         rows: np.ndarray = self._mapping.rows(act.action, None if contract is None else contract.action)
         hz = (contract and contract.control_hz) or _HZ
-        return lerobot.write_chunk(rows[: robot.actions_per_chunk], seen.timestamp, seen.timestep, 1 / hz)
+        return lerobot.write_chunk(rows[: waiting.robot.actions_per_chunk], seen.timestamp, seen.timestep, 1 / hz)
 
 
 class LeRobotDialectConfig(KeylessPortConfig):
@@ -280,13 +274,13 @@ class LeRobotDialect(PortDialect):
         self._clients.add(context.peer(), make)
 
     def _set_up(self, message: bytes, context: Any) -> None:
-        with self._client(context) as client:
+        with self._request(context) as client:
             if (data := lerobot.read_data(message)) is None:
                 raise MalformedMessage("policy instructions: got none")
             client.set_up(lerobot.read_instructions(data, self.context.limits))
 
     def _observe(self, parts: Iterator[bytes], context: Any) -> None:
-        with self._client(context) as client:
+        with self._request(context) as client:
             robot = self.config.rank == "robot"
             admission = MessageAdmission(self.context.admission, self.context.limits, None, robot=robot, inline=False)
             self._uploads[context] = time.monotonic()
@@ -297,17 +291,15 @@ class LeRobotDialect(PortDialect):
             client.observe(data, admission)
 
     def _act(self, _: bytes, context: Any) -> bytes | None:
-        with self._client(context) as client:
+        with self._request(context) as client:
             actions = client.actions()
         return None if actions is None else lerobot.write_data(actions)
 
-    @contextlib.contextmanager
-    def _client(self, context: Any) -> Iterator[LeRobotConnection]:
-        """Yield the client of a request, identified by its connection."""
+    def _request(self, context: Any) -> AbstractContextManager[LeRobotConnection]:
+        """Return the context of a request, with its client, identified by its connection."""
         if (client := self._clients.get(context.peer())) is None:
             raise NotReset("Ready: got none over this connection, or it was idle for too long; start the client again")
-        with client.request():
-            yield client
+        return client.request()
 
     def _watch(self) -> None:
         """Remove clients that are gone, and end observations that take too long, until the dialect is closed."""

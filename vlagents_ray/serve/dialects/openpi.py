@@ -171,8 +171,7 @@ class RoboArenaDialect(MapDialect):
     config: RoboArenaDialectConfig
 
     def first(self) -> dict[str, Any]:
-        ours = {"mapping", "rank", "bare"}
-        return self.config.model_dump(mode="json", include=RoboArenaDialectConfig.model_fields.keys() - ours)
+        return self.config.model_dump(mode="json", exclude={"mapping", "rank", "bare"})
 
     def speaks(self, message: dict[str, Any]) -> bool:
         return "endpoint" in message

@@ -191,7 +191,11 @@ class _TimedWebSocket:
             if self._end is None:
                 raise
             _uncancel(task)
-            await self._close(*self._end)
+            code, reason = self._end
+            logger.info("a WebSocket is closed: %s", reason)
+            with suppress(asyncio.TimeoutError, RuntimeError):  # the client does not read, or closed the connection
+                closing = self._send({"type": "websocket.close", "code": code, "reason": reason[:120]})
+                await asyncio.wait_for(closing, _TICK_S)
         finally:
             self._timer.cancel()
 
@@ -216,12 +220,6 @@ class _TimedWebSocket:
         if isinstance(self._caller, Caller) and (reason := self._caller.refusal()) is not None:
             return _POLICY_VIOLATION, reason
         return None
-
-    async def _close(self, code: int, reason: str) -> None:
-        logger.info("a WebSocket is closed: %s", reason)
-        with suppress(asyncio.TimeoutError, RuntimeError):  # the client does not read, or has closed the connection
-            closing = self._send({"type": "websocket.close", "code": code, "reason": reason[:120]})
-            await asyncio.wait_for(closing, _TICK_S)
 
 
 def _cancel_again(over: bool) -> None:

@@ -65,46 +65,6 @@ class ReadBuffer(threading.local):
         return self._view[:count], control
 
 
-class Acceptor:
-    """Accepts connections; errors (an aborted connection, EMFILE) never stop the listener."""
-
-    def __init__(self, listener: socket.socket, on_connection: Callable[[socket.socket], None]) -> None:
-        """Prepare to accept; `on_connection` gets non-blocking connections, and must close those that it refuses."""
-        self._listener, self._on_connection = listener, on_connection
-        # Without a free descriptor a client could not even be refused, and the listener would stay readable.
-        self._spare = _descriptor()
-
-    def accept(self) -> None:
-        """Accept one client; call this when the listener is readable."""
-        try:
-            connection, _ = self._listener.accept()
-        except OSError as error:
-            logger.warning("a client was not let in: %s", error)
-            if error.errno in (errno.EMFILE, errno.ENFILE):
-                self._refuse()
-            return
-        try:
-            connection.setblocking(False)
-            self._on_connection(connection)
-        except Exception:
-            logger.exception("a client was not let in")
-            connection.close()
-
-    def close(self) -> None:
-        """Free the spare descriptor; the listener stays open."""
-        self._spare.close()
-
-    def _refuse(self) -> None:
-        self._spare.close()
-        with contextlib.suppress(OSError):
-            self._listener.accept()[0].close()
-        self._spare = _descriptor()
-
-
-def _descriptor() -> BinaryIO:
-    return Path(os.devnull).open("rb")
-
-
 class PolledConnection(ABC):
     """One connection of a client; its sessions end with it."""
 
@@ -136,8 +96,10 @@ class PolledConnection(ABC):
         """Send a close code and its reason, if the protocol has close codes; called with the lock held."""
 
     def _continue(self) -> None:
-        """Continue after a reason for not polling has ended; called on the polling thread."""
-        self._poll()
+        """Poll again if no reason against it is left; called on the polling thread."""
+        if not (self._ended or self._polled or self._unpolled_for):
+            self._polled = True
+            self._poller.watch(self._connection, self.ready)
 
     def ready(self) -> None:
         """Read the connection; the batch queue calls this."""
@@ -157,11 +119,6 @@ class PolledConnection(ABC):
     def _resume(self, reason: str) -> None:
         self._unpolled_for.discard(reason)
         self._continue()
-
-    def _poll(self) -> None:
-        if not (self._ended or self._polled or self._unpolled_for):
-            self._polled = True
-            self._poller.watch(self._connection, self.ready)
 
     def _is_throttled(self) -> bool:
         """Return whether the client's key is over its rate; if so, schedule the next reading of the connection."""
@@ -247,8 +204,12 @@ class PolledConnection(ABC):
 C = TypeVar("C", bound=PolledConnection)
 
 
+def _descriptor() -> BinaryIO:
+    return Path(os.devnull).open("rb")
+
+
 class PolledServer(ABC, Generic[C]):
-    """Listens from `open` on; the polling thread of the batch queue reads all connections.
+    """Listens from `open` on; the polling thread of the batch queue accepts clients and reads all connections.
 
     Args:
         admit: Returns the caller that a key belongs to, or raises for an invalid key; or the reason why no key is
@@ -262,24 +223,44 @@ class PolledServer(ABC, Generic[C]):
         self.engine, self.limits, self.admit = engine, limits, admit
         self._clients: set[C] = set()
         self._listener = listener
-        self._acceptor = Acceptor(listener, self._add_client)
+        # Without a free descriptor a client could not even be refused, and the listener would stay readable.
+        self._spare = _descriptor()
 
     @abstractmethod
     def _add_client(self, connection: socket.socket) -> None:
-        """Serve a client by `_serve`, or close its connection."""
+        """Serve a client by `_serve`, or close its connection, which is non-blocking."""
 
     def open(self) -> None:
         """Accept clients; call this before the engine starts."""
-        self.engine.queue.poller.watch(self._listener, self._acceptor.accept)
+        self.engine.queue.poller.watch(self._listener, self.accept)
         each_half_second.add(self.close_overdue)
 
     def close(self) -> None:
         """Close the listener and all connections; call this after the engine has ended."""
         each_half_second.remove(self.close_overdue)
         self._listener.close()
-        self._acceptor.close()
+        self._spare.close()
         for client in list(self._clients):
             client.release()
+
+    def accept(self) -> None:
+        """Accept one client; errors (an aborted connection, EMFILE) never stop the listener, which is readable."""
+        try:
+            connection, _ = self._listener.accept()
+        except OSError as error:
+            logger.warning("a client was not let in: %s", error)
+            if error.errno in (errno.EMFILE, errno.ENFILE):
+                self._spare.close()
+                with contextlib.suppress(OSError):
+                    self._listener.accept()[0].close()
+                self._spare = _descriptor()
+            return
+        try:
+            connection.setblocking(False)
+            self._add_client(connection)
+        except Exception:
+            logger.exception("a client was not let in")
+            connection.close()
 
     def close_overdue(self) -> None:
         """Close the connections that are overdue, or whose key is no longer valid; may be called on any thread."""

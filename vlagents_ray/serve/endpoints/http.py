@@ -15,6 +15,7 @@ import asyncio
 import time
 import uuid
 from collections.abc import Awaitable, Callable, Sequence
+from dataclasses import dataclass
 from functools import partial
 from typing import Any, cast
 
@@ -40,6 +41,7 @@ from vlagents_ray.serve.requests import Message as Incoming
 
 _POLICY_VIOLATION, _TRY_AGAIN_LATER = 1008, 1013  # WebSocket close codes
 _HEALTH_S = 1.5  # `/healthz` replies within this time
+_NO_PATH = "no such path; GET /docs lists what there is"
 
 
 def build_http_app(
@@ -77,43 +79,38 @@ def build_http_app(
     return app
 
 
+@dataclass(frozen=True, slots=True)
 class _HttpEndpoint:
-    def __init__(
-        self,
-        engine: Engine,
-        metadata: Callable[[], dict[str, Any]],
-        limits: messages.Limits,
-        machine_metadata: Callable[[str], Awaitable[dict[str, Any]]] | None,
-    ) -> None:
-        self._engine, self._metadata, self._limits = engine, metadata, limits
-        self._requests = http_messages.RequestDecoder(limits)
-        self._machine_metadata = machine_metadata
+    engine: Engine
+    metadata: Callable[[], dict[str, Any]]
+    limits: messages.Limits
+    machine_metadata: Callable[[str], Awaitable[dict[str, Any]]] | None
 
     async def health(self, http: HttpRequest) -> Response:
         """Reply whether the policy is ready, or its step of loading, and nothing else: this path needs no key."""
         try:
-            ready = await asyncio.wait_for(asyncio.to_thread(lambda: self._engine.ready), _HEALTH_S)
+            ready = await asyncio.wait_for(asyncio.to_thread(lambda: self.engine.ready), _HEALTH_S)
         except asyncio.TimeoutError:  # the policy's own check hangs
             ready = False
         if ready:
             return PlainTextResponse("OK\n")
-        step = self._engine.models.step
+        step = self.engine.models.step
         loading = f"the policy is loading{step and f' ({step})'}"
         unready = PolicyUnavailable(f"{loading}, or did not load; GET /v1/metadata says which")
         return http_messages.problem_response(unready, http_messages.request_id(http))
 
     async def show_metadata(self, http: HttpRequest) -> Response:
         machine = http.headers.get(messages.MACHINE_HEADER)
-        if machine and self._machine_metadata is not None and self._engine.ready:
-            return JSONResponse(plain_values(await self._machine_metadata(machine)))
-        return self._when_ready(http, lambda: JSONResponse(plain_values(self._metadata())))
+        if machine and self.machine_metadata is not None and self.engine.ready:
+            return JSONResponse(plain_values(await self.machine_metadata(machine)))
+        return self._when_ready(http, lambda: JSONResponse(plain_values(self.metadata())))
 
     async def docs(self, http: HttpRequest) -> Response:
-        return self._when_ready(http, lambda: http_messages.html_response(docs_page(self._metadata()), styles=[STYLE]))
+        return self._when_ready(http, lambda: http_messages.html_response(docs_page(self.metadata()), styles=[STYLE]))
 
     def _when_ready(self, http: HttpRequest, answer: Callable[[], Response]) -> Response:
         try:
-            self._engine.require_ready()
+            self.engine.require_ready()
         except VLAgentsError as error:
             return http_messages.problem_response(error, http_messages.request_id(http), 503)
         return answer()
@@ -122,14 +119,13 @@ class _HttpEndpoint:
         """Return the handler of `POST /v1/<op>`."""
 
         async def handle(http: HttpRequest) -> Response:
-            incoming = Incoming(self._engine.stats, "http", op)
+            incoming = Incoming(self.engine.stats, "http", op)
             name, headers = http_messages.request_id(http), http_messages.headers_of(http.scope)
             try:
-                sender = Sender(
-                    self._engine, "http", http_messages.session_id(http), caller=current_caller(), connected=False
-                )
-                admission = sender.admission(self._limits, rank=headers.get(messages.RANK_HEADER, "robot"))
-                decoded = await self._requests.read(op, _timed(http, incoming), admission, name)
+                session_id = http_messages.session_id(http)
+                sender = Sender(self.engine, "http", session_id, caller=current_caller(), connected=False)
+                admission = sender.admission(self.limits, rank=headers.get(messages.RANK_HEADER, "robot"))
+                decoded = await http_messages.read_requests(op, _timed(http, incoming), admission, name)
                 incoming.decoded(decoded)
                 if decoded.requests:
                     name = decoded.requests[0].request_id
@@ -153,12 +149,12 @@ class _HttpEndpoint:
     async def stream(self, socket: WebSocket) -> None:
         """Serve one WebSocket, whose sessions end with it; a malformed request gets an error and affects no session."""
         await socket.accept()
-        if len(self._engine.sessions) >= self._engine.sessions.limit:
-            full = self._engine.sessions.full()
+        if len(self.engine.sessions) >= self.engine.sessions.limit:
+            full = self.engine.sessions.full()
             await socket.send_bytes(encode_replies([messages.Reply(error=full)]))
             await socket.close(_TRY_AGAIN_LATER, str(full)[:120])
             return
-        sender = Sender(self._engine, "websocket", caller=current_caller())
+        sender = Sender(self.engine, "websocket", caller=current_caller())
         try:
             while not sender.refused_too_often:
                 await sender.wait_unthrottled()
@@ -176,12 +172,12 @@ class _HttpEndpoint:
         """Return the answer to a message of a WebSocket, a frame or a probe; None is a text message."""
         if frame is not None and messages.is_probe(frame):
             try:
-                messages.read_probe(frame, sender.admission(self._limits, len(frame), "simulation"))
+                messages.read_probe(frame, sender.admission(self.limits, len(frame), "simulation"))
                 return messages.probe_answer(len(frame))
             except VLAgentsError as error:
                 return encode_replies([messages.Reply(error=error)])
         incoming = sender.message()
-        admission = sender.admission(self._limits, 0 if frame is None else len(frame))
+        admission = sender.admission(self.limits, 0 if frame is None else len(frame))
         try:
             admission.begin_message()
             if frame is None:
@@ -209,9 +205,7 @@ def _timed(http: HttpRequest, incoming: Incoming) -> HttpRequest:
 async def _no_such_path(of_http: ASGIApp, scope: Scope, receive: Receive, send: Send) -> None:
     """Refuse an unknown path: Starlette would refuse a WebSocket with 403, which means an invalid key."""
     if scope["type"] == "websocket":
-        await http_messages.deny(
-            WebSocket(scope, receive, send), UnknownApp("no such path; GET /docs lists what there is")
-        )
+        await http_messages.deny(WebSocket(scope, receive, send), UnknownApp(_NO_PATH))
     else:
         await of_http(scope, receive, send)
 
@@ -220,9 +214,7 @@ async def _http_problem(http: HttpRequest, error: Exception) -> Response:
     """Reply to a request that the router refuses: an unknown path, or an unsupported method."""
     refused = cast(HTTPException, error)
     if refused.status_code == 404:
-        return http_messages.problem_response(
-            UnknownApp("no such path; GET /docs lists what there is"), http_messages.request_id(http)
-        )
+        return http_messages.problem_response(UnknownApp(_NO_PATH), http_messages.request_id(http))
     cause = MalformedMessage(f"{refused.detail}; GET /docs lists what there is")
     response = http_messages.problem_response(cause, http_messages.request_id(http), refused.status_code)
     response.headers.update(refused.headers or {})

@@ -59,131 +59,127 @@ class _Refused(MultiPartException):
         self.error = error
 
 
-class RequestDecoder:
-    """Reads HTTP requests; an error that concerns the whole body is raised."""
+async def read_requests(op: Op, http: HttpRequest, admission: MessageAdmission, name: str) -> Decoded:
+    """Read the requests of a POST to the path of `op`; the first one gets the id `name` if it has none.
 
-    def __init__(self, limits: Limits) -> None:
-        self._limits = limits
-
-    async def read(self, op: Op, http: HttpRequest, admission: MessageAdmission, name: str) -> Decoded:
-        """Read the requests of a POST to the path of `op`; the first one gets the id `name` if it has none."""
-        headers = headers_of(http.scope)
-        kind = headers.get("content-type", "").partition(";")[0].strip().lower()
-        declared = headers.get("content-length", "")
-        if declared.isdigit() and int(declared) > self._limits.body_bytes:
-            raise MessageTooLarge(f"body: declares {declared} bytes, the limit is {self._limits.body_bytes}")
-        if kind == "multipart/form-data":
-            request = await self._read_form(op, http, admission)
-        elif op == "close" and not kind:
-            request = Request("close")
+    An error that concerns the whole body is raised.
+    """
+    headers, limits = headers_of(http.scope), admission.limits
+    kind = headers.get("content-type", "").partition(";")[0].strip().lower()
+    declared = headers.get("content-length", "")
+    if declared.isdigit() and int(declared) > limits.body_bytes:
+        raise MessageTooLarge(f"body: declares {declared} bytes, the limit is {limits.body_bytes}")
+    if kind == "multipart/form-data":
+        decoded = Decoded([await _read_form(op, http, admission)], {})
+    elif op == "close" and not kind:
+        decoded = Decoded([Request("close")], {})
+    else:
+        body = await read_body(http, admission)
+        if kind == CONTENT_TYPE:
+            decoded = await admission.decoded(partial(decode_requests, body))
+        elif kind == "application/json":
+            read = partial(request_from_parts, op, body, {})
+            decoded = Decoded([await admission.decoded(read, long=len(body) > LONG_BYTES)], {})
         else:
-            body = await self.body(http, admission)
-            if kind == CONTENT_TYPE:
-                return self._checked(op, await admission.decoded(partial(decode_requests, body)), http, name)
-            if kind == "application/json":
-                request = await admission.decoded(
-                    partial(request_from_parts, op, body, {}), long=len(body) > LONG_BYTES
-                )
-            else:
-                raise MalformedMessage(
-                    f"content-type: got {kind or 'none'!r}, "
-                    f"want multipart/form-data, application/json or {CONTENT_TYPE}"
-                )
-        return self._checked(op, Decoded([request], {}), http, name)
-
-    def _checked(self, op: Op, decoded: Decoded, http: HttpRequest, name: str) -> Decoded:
-        """Return the requests with the session, deadline and class in the headers."""
-        headers = headers_of(http.scope)
-        stated = headers.get(REQUEST_ID_HEADER, "")
-        if not is_name(stated):
             raise MalformedMessage(
-                f"header {REQUEST_ID_HEADER}: got {stated[:40]!r}, want 1 to 128 visible ASCII characters"
+                f"content-type: got {kind or 'none'!r}, want multipart/form-data, application/json or {CONTENT_TYPE}"
             )
-        deadline, rank, step = headers.get(DEADLINE_HEADER), headers.get(RANK_HEADER), headers.get(STEP_HEADER)
-        stated_by_headers: dict[str, Any] = {}
-        for place, request in enumerate(decoded.requests):
-            if request.op != op:
-                raise MalformedMessage(f"op: the frame says {request.op!r}, the path says {op!r}")
-            if deadline:
-                stated_by_headers["deadline_ms"] = _positive(deadline)
-            if step:
-                stated_by_headers["step"] = _whole(step)
-            if rank:
-                stated_by_headers["rank"] = rank
-            request_id = request.request_id or ("" if place else name)
-            decoded.requests[place] = replace(request, request_id=request_id, **stated_by_headers)
-            if rank:
-                check_request(decoded.requests[place], self._limits)
-        return decoded
+    _read_headers(op, decoded.requests, headers, name, limits)
+    return decoded
 
-    async def _read_form(self, op: Op, http: HttpRequest, admission: MessageAdmission) -> Request:
-        _require_uncompressed(http)
-        limits = self._limits
-        document: str | bytes | None = None
-        files: dict[str, bytes] = {}
-        try:
-            async with HttpRequest(http.scope, self._limited(http, admission)).form(
-                max_files=limits.cameras + 1, max_fields=limits.cameras + 1, max_part_size=limits.body_bytes
-            ) as form:
-                for name, part in form.multi_items():
-                    data = part if isinstance(part, str) else await part.read()
-                    camera = name.removeprefix(CAMERA_PREFIX)
-                    if (name == "obs" and document is not None) or (name != camera and camera in files):
-                        raise MalformedMessage(f"form: got the part {name[:80]!r} twice, want it once")
-                    if name == "obs":
-                        document = data
-                    elif camera not in ("", name) and isinstance(data, bytes):
-                        files[camera] = data
-                    else:
-                        raise MalformedMessage(f"form: {_wrong_part(name)}")
-        except (MultiPartException, HTTPException) as error:
-            for refused in (error, error.__context__):
-                if isinstance(refused, _Refused):
-                    raise refused.error from None
-            text = error.message if isinstance(error, MultiPartException) else error.detail
-            raise MalformedMessage(f"form: {text}") from error
-        if document is None:
-            raise MalformedMessage("form: no part 'obs'; send a JSON document, {} at least")
-        return await admission.decoded(
-            partial(request_from_parts, op, document, files), long=len(document) > LONG_BYTES
+
+def _read_headers(op: Op, requests: list[Request], headers: dict[str, str], name: str, limits: Limits) -> None:
+    """Check the requests, and add the deadline, step and class in the headers to them."""
+    stated = headers.get(REQUEST_ID_HEADER, "")
+    if not is_name(stated):
+        raise MalformedMessage(
+            f"header {REQUEST_ID_HEADER}: got {stated[:40]!r}, want 1 to 128 visible ASCII characters"
         )
+    deadline, rank, step = headers.get(DEADLINE_HEADER), headers.get(RANK_HEADER), headers.get(STEP_HEADER)
+    stated_by_headers: dict[str, Any] = {}
+    for place, request in enumerate(requests):
+        if request.op != op:
+            raise MalformedMessage(f"op: the frame says {request.op!r}, the path says {op!r}")
+        if deadline:
+            stated_by_headers["deadline_ms"] = _positive(deadline)
+        if step:
+            stated_by_headers["step"] = _whole(step)
+        if rank:
+            stated_by_headers["rank"] = rank
+        request_id = request.request_id or ("" if place else name)
+        requests[place] = replace(request, request_id=request_id, **stated_by_headers)
+        if rank:
+            check_request(requests[place], limits)
 
-    def _limited(self, http: HttpRequest, admission: MessageAdmission) -> Receive:
-        """Return a `receive` that limits the whole body: the parser limits only single parts, and files not at all."""
-        size = 0
 
-        async def receive() -> Message:
-            nonlocal size
-            message = await http.receive()
-            length = len(message.get("body", b""))
-            size += length
-            try:
-                if size > self._limits.body_bytes:
-                    raise MessageTooLarge(f"body: over {self._limits.body_bytes} bytes, the limit")
-                if length:
-                    admission.receive(length)
-            except VLAgentsError as error:
-                raise _Refused(error) from error
-            return message
+async def _read_form(op: Op, http: HttpRequest, admission: MessageAdmission) -> Request:
+    _require_uncompressed(http)
+    limits = admission.limits
+    document: str | bytes | None = None
+    files: dict[str, bytes] = {}
+    try:
+        async with HttpRequest(http.scope, _limited(http, admission)).form(
+            max_files=limits.cameras + 1, max_fields=limits.cameras + 1, max_part_size=limits.body_bytes
+        ) as form:
+            for name, part in form.multi_items():
+                data = part if isinstance(part, str) else await part.read()
+                camera = name.removeprefix(CAMERA_PREFIX)
+                if (name == "obs" and document is not None) or (name != camera and camera in files):
+                    raise MalformedMessage(f"form: got the part {name[:80]!r} twice, want it once")
+                if name == "obs":
+                    document = data
+                elif camera not in ("", name) and isinstance(data, bytes):
+                    files[camera] = data
+                else:
+                    raise MalformedMessage(f"form: {_wrong_part(name)}")
+    except (MultiPartException, HTTPException) as error:
+        for refused in (error, error.__context__):
+            if isinstance(refused, _Refused):
+                raise refused.error from None
+        text = error.message if isinstance(error, MultiPartException) else error.detail
+        raise MalformedMessage(f"form: {text}") from error
+    if document is None:
+        raise MalformedMessage("form: no part 'obs'; send a JSON document, {} at least")
+    return await admission.decoded(partial(request_from_parts, op, document, files), long=len(document) > LONG_BYTES)
 
-        return receive
 
-    async def body(self, http: HttpRequest, admission: MessageAdmission) -> bytes:
-        """Return the whole body.
+def _limited(http: HttpRequest, admission: MessageAdmission) -> Receive:
+    """Return a `receive` that limits the whole body: the parser limits only single parts, and files not at all."""
+    size, limit = 0, admission.limits.body_bytes
 
-        Raises:
-            MessageTooLarge: The body is over its limit.
-            MalformedMessage: The body is compressed.
-            Overloaded: The replica has no room for the body among its messages in flight.
-        """
-        _require_uncompressed(http)
+    async def receive() -> Message:
+        nonlocal size
+        message = await http.receive()
+        length = len(message.get("body", b""))
+        size += length
         try:
-            body = await HttpRequest(http.scope, self._limited(http, admission)).body()
-        except _Refused as refused:
-            raise refused.error from None
-        if body.startswith(_GZIP):
-            raise MalformedMessage("body: got gzip, want it uncompressed; send it as it is")
-        return body
+            if size > limit:
+                raise MessageTooLarge(f"body: over {limit} bytes, the limit")
+            if length:
+                admission.receive(length)
+        except VLAgentsError as error:
+            raise _Refused(error) from error
+        return message
+
+    return receive
+
+
+async def read_body(http: HttpRequest, admission: MessageAdmission) -> bytes:
+    """Return the whole body.
+
+    Raises:
+        MessageTooLarge: The body is over its limit.
+        MalformedMessage: The body is compressed.
+        Overloaded: The replica has no room for the body among its messages in flight.
+    """
+    _require_uncompressed(http)
+    try:
+        body = await HttpRequest(http.scope, _limited(http, admission)).body()
+    except _Refused as refused:
+        raise refused.error from None
+    if body.startswith(_GZIP):
+        raise MalformedMessage("body: got gzip, want it uncompressed; send it as it is")
+    return body
 
 
 def _wrong_part(name: str) -> str:

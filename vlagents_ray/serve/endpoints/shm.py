@@ -272,7 +272,17 @@ class MemoryFiles:
         number, flags, length = LocalAddress.REQUEST.unpack_from(message)
         if descriptors:
             self._add(number, descriptors.pop(0))
-        memory = self._memory(number, length)
+        file = self._files.get(number)
+        if file is None or length > len(file):
+            raise MalformedMessage(f"local: {length} bytes in memory file {number}, which is not there or shorter")
+        # The memory in place: the client does not write into it until a reply reports it as freed.
+        memory = np.frombuffer(file, np.uint8, length)
+        if len(self._views) < _MAX_VIEWS:
+            self._views[number] = weakref.ref(memory, partial(self._release, number))
+        else:  # the policy already holds views of many files
+            self._freed.add(number)
+            memory = memory.copy()
+            memory.flags.writeable = False
         return memory, bool(flags & LocalAddress.COMPACT), message[LocalAddress.REQUEST.size :]
 
     def freed(self) -> int:
@@ -285,23 +295,6 @@ class MemoryFiles:
     def free(self) -> None:
         """Free all memory; memory that the policy still views is freed with the last view."""
         self._files.clear()
-
-    def _memory(self, number: int, length: int) -> np.ndarray:
-        """Return the client's memory in place; the client does not write into it until a reply reports it as freed.
-
-        If the policy already holds views of many files, return a copy.
-        """
-        file = self._files.get(number)
-        if file is None or length > len(file):
-            raise MalformedMessage(f"local: {length} bytes in memory file {number}, which is not there or shorter")
-        memory = np.frombuffer(file, np.uint8, length)
-        if len(self._views) >= _MAX_VIEWS:
-            self._freed.add(number)
-            memory = memory.copy()
-            memory.flags.writeable = False
-            return memory
-        self._views[number] = weakref.ref(memory, partial(self._release, number))
-        return memory
 
     def _release(self, number: int, _: object) -> None:
         self._views.pop(number, None)

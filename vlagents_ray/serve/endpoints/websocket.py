@@ -24,7 +24,6 @@ from typing import ClassVar
 
 from websockets.frames import Frame, Opcode
 from websockets.http11 import Request as Handshake
-from websockets.http11 import Response
 from websockets.protocol import State
 from websockets.server import ServerProtocol
 
@@ -314,7 +313,15 @@ class WebSocketConnection(PolledConnection):
             self._protocol.receive_data(head)
             events = self._protocol.events_received()
         if len(events) == 1 and isinstance(events[0], Handshake):
-            response = self._handshake_response(events[0])
+            try:
+                self.caller = self._server.identify(self, events[0])
+                response = self._protocol.accept(events[0])
+            except VLAgentsError as refused:
+                response = self._protocol.reject(refused.status, f"{refused}\n")
+                if isinstance(refused, TooManyRequests | PolicyUnavailable):
+                    response.headers["Retry-After"] = "1"
+                if isinstance(refused, TooManyRequests):
+                    self._refused_for_s = refused.retry_after_s
             with self._sending:
                 self._protocol.send_response(response)
         if self._protocol.state is not State.OPEN or self.caller is None:
@@ -340,18 +347,6 @@ class WebSocketConnection(PolledConnection):
         else:
             refuse()
 
-    def _handshake_response(self, request: Handshake) -> Response:
-        try:
-            self.caller = self._server.identify(self, request)
-            return self._protocol.accept(request)
-        except VLAgentsError as refused:
-            response = self._protocol.reject(refused.status, f"{refused}\n")
-            if isinstance(refused, TooManyRequests | PolicyUnavailable):
-                response.headers["Retry-After"] = "1"
-            if isinstance(refused, TooManyRequests):
-                self._refused_for_s = refused.retry_after_s
-            return response
-
     def _process_frames(self) -> None:
         """Process the received frames in order, until one of them has to wait."""
         while self._frames and not (self._ended or self._unpolled_for & {DECODING, THROTTLED}):
@@ -367,7 +362,7 @@ class WebSocketConnection(PolledConnection):
 
     def _continue(self) -> None:
         self._process_frames()
-        self._poll()
+        super()._continue()
 
     def _process(self, frame: Frame, arrived: float, admission: MessageAdmission | None) -> None:
         if self._sender is None:  # no frame is read before the handshake is accepted

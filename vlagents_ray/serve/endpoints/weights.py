@@ -136,8 +136,7 @@ class _WeightsEndpoint:
                     )
             # When all values have arrived, the push does not depend on the learner's connection.
             pushed = await asyncio.shield(self._replicas.push_received(reader.values(), options))
-            replicas = len(pushed.replicas)
-            return {"version": pushed.version, "fingerprint": pushed.fingerprint, "replicas": replicas}
+            return {"version": pushed.version, "fingerprint": pushed.fingerprint, "replicas": len(pushed.replicas)}
         finally:
             self._receiving = False
 

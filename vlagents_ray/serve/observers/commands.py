@@ -8,7 +8,6 @@ reports the outcome. The server itself executes `SAVE`.
 
 from __future__ import annotations
 
-import itertools
 import logging
 import threading
 import time
@@ -70,8 +69,6 @@ class CommandBoard:
         `save` writes the last seconds of a session and returns the path; it may be slow, and may raise errors.
         """
         self._save, self._sessions, self._clock = save, sessions, clock
-        self._numbers = itertools.count(1)
-        self._prefix = uuid.uuid4().hex[:8]
         self._presses: dict[str, list[Press]] = {}  # by session, oldest first
         self._lock = threading.Lock()
 
@@ -90,7 +87,7 @@ class CommandBoard:
             )
         if session_id not in self._sessions:
             raise UnknownSession(f"session {session_id[:80]!r}: is not here; it ended, or has begun again elsewhere")
-        pressed = Press(f"{self._prefix}-{next(self._numbers)}", do, by, self._clock())
+        pressed = Press(uuid.uuid4().hex, do, by, self._clock())
         self.forget_others(self._sessions.ids())
         with self._lock:
             held = self._presses.setdefault(session_id, [])

@@ -49,7 +49,7 @@ from vlagents_ray.serve.access.audit import log_pressed
 from vlagents_ray.serve.access.origin_check import require_same_origin
 from vlagents_ray.serve.endpoints.access_middleware import LIVE_PAGE, AccessMiddleware
 from vlagents_ray.serve.endpoints.http_messages import answer_error, deny, html_response
-from vlagents_ray.serve.observers.live_view import Fleet, Viewer
+from vlagents_ray.serve.observers.live_view import Fleet
 
 PATH = "/v1/live"
 _PROTOCOL = "vlagents.live"
@@ -96,12 +96,9 @@ class _LiveEndpoint:
 
     async def show(self, http: HttpRequest) -> Response:
         self._require_watch(http)
-        viewer = self._fleet.add()
-        try:
+        with self._fleet.viewer() as viewer:
             document, _ = await viewer.next()
-            return JSONResponse(document)
-        finally:
-            self._fleet.remove(viewer)
+        return JSONResponse(document)
 
     async def video(self, http: HttpRequest) -> Response:
         self._require_watch(http)
@@ -135,10 +132,15 @@ class _LiveEndpoint:
         caller = current_caller()
         if isinstance(caller, Caller):
             caller.note("watches", "the sessions")
-        viewer = self._fleet.add()
         self._watching += 1
         try:
-            await self._feed(socket, viewer)
+            with self._fleet.viewer() as viewer:
+                while True:
+                    viewer.shown = frozenset(await self._asked(socket))
+                    document, files = await viewer.next()
+                    self._scopes.require(_WATCH)
+                    may_operate = self._videos is None and self._scopes.may(_OPERATE)
+                    await socket.send_bytes(_message({**document, "may_operate": may_operate}, files))
         except WebSocketDisconnect:
             return
         except VLAgentsError as error:
@@ -147,15 +149,6 @@ class _LiveEndpoint:
                 await socket.close(_POLICY_VIOLATION)
         finally:
             self._watching -= 1
-            self._fleet.remove(viewer)
-
-    async def _feed(self, socket: WebSocket, viewer: Viewer) -> None:
-        while True:
-            viewer.shown = frozenset(await self._asked(socket))
-            document, files = await viewer.next()
-            self._scopes.require(_WATCH)
-            may_operate = self._videos is None and self._scopes.may(_OPERATE)
-            await socket.send_bytes(_message({**document, "may_operate": may_operate}, files))
 
     async def _asked(self, socket: WebSocket) -> list[str]:
         try:

@@ -9,7 +9,8 @@ import asyncio
 import logging
 import time
 from collections import Counter, deque
-from collections.abc import Awaitable, Callable, Collection, Mapping
+from collections.abc import Awaitable, Callable, Collection, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from typing import Any, Protocol
 
@@ -287,20 +288,20 @@ class Fleet:
         self._gathering: asyncio.Task[None] | None = None
         self._read: dict[str, int] = {}  # number of the last snapshot, by replica; "" is this one
 
-    def add(self) -> Viewer:
-        """Add a viewer, and gather snapshots for it from now on."""
+    @contextmanager
+    def viewer(self) -> Iterator[Viewer]:
+        """Yield a viewer, for which snapshots are gathered within the context; without viewers nothing is gathered."""
         viewer = Viewer()
         self.viewers.add(viewer)
         if self._gathering is None:
             self._gathering = asyncio.ensure_future(self._gather())
-        return viewer
-
-    def remove(self, viewer: Viewer) -> None:
-        """Remove a viewer; without viewers nothing is gathered."""
-        self.viewers.discard(viewer)
-        if not self.viewers and self._gathering is not None:
-            self._gathering.cancel()
-            self._gathering = None
+        try:
+            yield viewer
+        finally:
+            self.viewers.discard(viewer)
+            if not self.viewers:
+                self._gathering.cancel()
+                self._gathering = None
 
     async def press(self, session: str, do: str, by: str) -> dict[str, Any]:
         """Give a command to a session of any replica, and describe it, as `CommandBoard.press` does."""

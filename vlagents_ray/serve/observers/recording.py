@@ -84,22 +84,9 @@ class _Recorded:
     at: float  # s since 1970
     obs: Obs | None  # of an act
     instruction: str
-    options: Any  # options of the reset, before the queue removes some of them; converted to text by `copy`
+    options: Any  # options of the reset, before the queue removes some of them; converted to text by `_copy`
     size: int  # size of its memory, bytes
     info: str = ""  # the observation's info, as text
-
-    def copy(self) -> None:
-        """Copy the data that may be in the client's memory."""
-        self.options = to_text(self.options) if self.op == "reset" else ""
-        if (obs := self.obs) is not None:
-            info = dict(obs.info)
-            captured = info.pop(CAPTURED, None)
-            self.info = to_text(info) if info else ""
-            captured_at = float(captured) if isinstance(captured, (int, float)) else self.at
-            self.obs = copied(replace(obs, info={CAPTURED: captured_at}, prepared=None))
-        texts = len(self.options) + len(self.info)
-        self.size += texts
-        self.recorder.count_held(texts)
 
     def __del__(self) -> None:
         self.recorder.count_held(-self.size)
@@ -175,8 +162,18 @@ class SessionRecorder(Observer):
             return True
 
     def _copy(self, recorded: _Recorded) -> None:
+        """Copy the data that may be in the client's memory."""
         try:
-            recorded.copy()
+            recorded.options = to_text(recorded.options) if recorded.op == "reset" else ""
+            if (obs := recorded.obs) is not None:
+                info = dict(obs.info)
+                captured = info.pop(CAPTURED, None)
+                recorded.info = to_text(info) if info else ""
+                captured_at = float(captured) if isinstance(captured, (int, float)) else recorded.at
+                recorded.obs = copied(replace(obs, info={CAPTURED: captured_at}, prepared=None))
+            texts = len(recorded.options) + len(recorded.info)
+            recorded.size += texts
+            self.count_held(texts)
         except Exception as error:  # noqa: BLE001 - an error of this request only
             logger.warning("recording: an act of session %s is left out: %s", recorded.session, error)
             self.dropped += 1

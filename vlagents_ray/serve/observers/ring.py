@@ -89,24 +89,21 @@ class Ring:
         if not self._saving.acquire(blocking=False):
             raise Overloaded("save: another session is being saved; press again when that is done")
         try:
-            return self._save(session)
+            self._writer.require_room()
+            with self._lock:
+                frames = deque(self._frames.get(session, ()))
+            if not frames:
+                raise InvalidInput(f"session {session!r}: nothing to save yet; it has acted on nothing")
+            found = next((one for one in self._sessions.all() if one.id == session), None)
+            self._writer.begin(session, "" if found is None else found.instruction)
+            while frames:
+                self._writer.add(session, _recorded(frames.popleft()))
+            return str(self._writer.end(session))
         except RecordingEnded as error:
             raise StorageFailed(f"live.folder: {error}; make room there") from error
         finally:
             self._writer.drop(session)  # remains of a failed attempt
             self._saving.release()
-
-    def _save(self, session: str) -> str:
-        self._writer.require_room()
-        with self._lock:
-            frames = deque(self._frames.get(session, ()))
-        if not frames:
-            raise InvalidInput(f"session {session!r}: nothing to save yet; it has acted on nothing")
-        found = next((one for one in self._sessions.all() if one.id == session), None)
-        self._writer.begin(session, "" if found is None else found.instruction)
-        while frames:
-            self._writer.add(session, _recorded(frames.popleft()))
-        return str(self._writer.end(session))
 
     def _newest(self, session: str) -> int:
         frames = self._frames.get(session)
