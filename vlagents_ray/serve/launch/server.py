@@ -79,9 +79,6 @@ def shut_down(client: Any) -> None:
     private.forget_serve(client)
 
 
-__all__ = ["Server", "deploy", "free_port", "running_server", "spread_over_gpus"]
-
-
 @dataclass(frozen=True, slots=True)
 class Server:
     """The addresses of a running server."""
