@@ -457,7 +457,7 @@ class Engine:
             for obs in request.history:
                 agent.observe(obs)
         info = {**model.identity, **info}  # a session with an adapter returns both by itself
-        spent = timing(pending.arrived, call.began, call.ended)
+        spent = timing(pending, call.began, call.ended)
         require_serializable(info, self._reply_bytes)
         session.agent, session.instruction = agent, request.instruction or ""
         model.padding.record_reset(request, opening.kwargs)
@@ -578,7 +578,7 @@ class Engine:
         for (pending, session), result in zip(acting, results, strict=True):
             reply = build_reply(pending, session, result, model.contract, self._reply_bytes, weights.info)
             if reply.error is None:
-                reply.timing = timing(pending.arrived, call.began - prepared_s, call.ended)
+                reply.timing = timing(pending, call.began - prepared_s, call.ended)
                 reply.timing["batch_size"] = len(acting)
             if defer and (robots or pending.rank is not Rank.ROBOT):
                 unsent.append((pending, reply))
