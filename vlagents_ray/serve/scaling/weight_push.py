@@ -44,7 +44,6 @@ class ThisReplica(WeightsReplica):
     """The local replica as the target of a push."""
 
     def __init__(self, name: str, updates: WeightUpdates) -> None:
-        """Set the updates of this replica's engine."""
         self.name, self._updates = name, updates
 
     async def weights(self, method: Callable[..., T], *args: Any) -> T:
@@ -63,7 +62,7 @@ class WeightPusher:
         self._known: set[str] = set()  # names of replicas that have answered
 
     async def push(self, values: Values, options: PushOptions) -> PushResult:
-        """Pushes new weights to all replicas, on the event loop of one of them."""
+        """Make all replicas act with new weights, or none of them."""
         begun = time.perf_counter()
         async with self._pushing:
             newest = {
