@@ -27,7 +27,7 @@ from benchmarks.processes import descendants
 from benchmarks.round_trips import LOOPBACK, StartClient
 from vlagents_ray.bench.line_process import LineProcess
 from vlagents_ray.errors import ConfigError
-from vlagents_ray.serve.launch.server import free_port
+from vlagents_ray.serve.ports import free_port
 
 SCRIPTS = Path(__file__).parent
 REQUIREMENTS = SCRIPTS / "requirements.txt"

@@ -31,7 +31,7 @@ from benchmarks.processes import descendants
 from benchmarks.throughput import ThroughputPlan, peer_fleet
 from vlagents_ray.bench.line_process import ProcessFailed
 from vlagents_ray.errors import ConfigError
-from vlagents_ray.serve.launch.server import free_port
+from vlagents_ray.serve.ports import free_port
 
 FAKE = f"""
 import socket, sys

@@ -14,7 +14,7 @@ from rpyc_client import Client, document
 
 from tests.integration.conftest import serving
 from vlagents_ray.serve.access.key_store import new_key
-from vlagents_ray.serve.launch.server import free_port
+from vlagents_ray.serve.ports import free_port
 
 
 def test_with_keys_on_only_who_has_one_is_served_and_a_revoked_one_is_not(shared_ray: None, tmp_path: Path) -> None:

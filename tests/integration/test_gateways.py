@@ -23,7 +23,7 @@ from virtual_environments import ended
 
 from tests.integration.conftest import SUPPORT, serving
 from vlagents_ray.bench.line_process import LineProcess
-from vlagents_ray.serve.launch.server import free_port
+from vlagents_ray.serve.ports import free_port
 
 ANSWER_S = 120.0  # the client's imports included
 

@@ -26,7 +26,8 @@ from rpyc_client import Client, call
 from vlagents_ray import Obs, RemoteAgent
 from vlagents_ray.envs import make_env
 from vlagents_ray.serve.launch.deployment_file import deployment
-from vlagents_ray.serve.launch.server import free_port, running_server
+from vlagents_ray.serve.launch.server import running_server
+from vlagents_ray.serve.ports import free_port
 
 COMMAND = [str(Path(sys.executable).parent / "vlagents-ray")]
 ROOT = Path(__file__).parent.parent.parent

@@ -80,7 +80,10 @@ class Replicas:
 
     def hand_over(self, number: int) -> int:
         """As when that one stops: how many sessions the others took."""
-        return asyncio.run_coroutine_threadsafe(self.migrators[number].hand_over(), self._loop).result(30)
+        held = self.engines[number].sessions.ids()
+        asyncio.run_coroutine_threadsafe(self.migrators[number].hand_over(), self._loop).result(30)
+        others = [engine for engine in self.engines if engine is not self.engines[number]]
+        return sum(session in engine.sessions for session in held for engine in others)
 
     async def _others(self, me: int) -> list[Peer]:
         return [_Peer(self, number) for number in range(len(self.engines)) if number != me]

@@ -133,8 +133,7 @@ class SessionTable(Generic[M]):
                     self._require_below(origin.prefix, most)
                 if len(self._sessions) >= self.limit:
                     self.drop_idle()
-                if len(self._sessions) >= self.limit:
-                    raise self.full()
+                self.require_room(session_id)
                 session = self._sessions[session_id] = Session(session_id)
                 self.opened += 1
         session.used = time.monotonic()

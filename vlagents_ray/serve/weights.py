@@ -85,10 +85,6 @@ class WeightsVersion:
         self.on_host = False  # whether they were moved out of the GPU's memory
         self.info = {POLICY: {"version": number, "fingerprint": digest}}  # for the info of each act
 
-    def describe(self) -> dict[str, Any]:
-        """Return the number and the fingerprint, for the metadata."""
-        return dict(self.info[POLICY])
-
 
 @dataclass(frozen=True, slots=True)
 class Rest:
@@ -591,7 +587,7 @@ class WeightUpdates:
             own = self.own()
         except PolicyUnavailable:
             return None
-        return {"newest": own.newest.describe(), "pinned": own.pinned.describe()}
+        return {"newest": own.newest.info[POLICY], "pinned": own.pinned.info[POLICY]}
 
     def newest(self) -> NewestVersion:
         """Return the newest version; raise `PolicyUnavailable` while the policy loads."""

@@ -95,8 +95,9 @@ class Application:
         return asyncio.run(self.pusher(self.replicas[at]).push(_gains(gain), options))
 
     def catch_up(self, own: Replica) -> int:
-        """As that replica does."""
-        return asyncio.run(self.pusher(own).catch_up())
+        """As that replica does; its newest version then."""
+        asyncio.run(self.pusher(own).catch_up())
+        return own.engine.weights.number
 
     def gains(self) -> list[tuple[int, float]]:
         """What each replica acts with."""

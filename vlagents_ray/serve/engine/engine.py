@@ -10,7 +10,7 @@ import logging
 import threading
 import time
 from collections.abc import Callable, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import Future, ThreadPoolExecutor, wait
 from contextlib import suppress
 from functools import partial
 from typing import Any
@@ -106,7 +106,6 @@ class Engine:
         self._loading = self.models.loading()
         self._unready: VLAgentsError | None = self._loading  # error for clients
         self._failure: PolicyFailed | None = None  # reason why the policy did not load, for the operator
-        self._not_started: BaseException | None = None  # the error itself, from the policy's thread
         self._hung: PolicyCall | None = None  # overdue call that `notice_hung` found
         self.draining = False  # whether the replica will stop, so that replies request reconnections
         self.drain_list = DrainList()  # connections to move only because others hold fewer sessions
@@ -119,7 +118,7 @@ class Engine:
             poller=poller,
         )
         self._thread = threading.Thread(target=self._serve, name="policy", daemon=True)
-        self._started = threading.Event()  # set when loading the policy has succeeded or failed
+        self._started: Future[None] = Future()  # done when loading the policy has succeeded or failed
         self.threaded = True  # whether that is the engine's own thread, and not the one that called `start`
         self.alive = False  # whether a thread takes batches from the queue
         self._unsent: list[tuple[PendingRequest, Reply]] = []  # sent by another thread while the next batch runs
@@ -141,10 +140,9 @@ class Engine:
             self.alive, self.threaded = True, threaded
             if threaded:
                 self._thread.start()
-                if not self._started.wait(limit_s := self.calls.limits.load_s):
+                if not wait([self._started], limit_s := self.calls.limits.load_s).done:
                     raise TimeoutError(f"not loaded within {limit_s:g} s, its limit")
-                if self._not_started is not None:
-                    raise self._not_started
+                self._started.result()
             else:
                 self.models.start()
                 self.queue.bind(driven=True)
@@ -163,13 +161,12 @@ class Engine:
         try:
             self.models.start()
         except BaseException as error:  # noqa: BLE001 - raised again by start(), on the caller's thread
-            self._not_started = error
             self.alive = False
             self.queue.poller.close()
+            self._started.set_exception(error)
             return
-        finally:
-            self.queue.bind()
-            self._started.set()
+        self.queue.bind()
+        self._started.set_result(None)
         try:
             while (taken := self.queue.next()) is not None:
                 if self._unsent:
@@ -460,7 +457,7 @@ class Engine:
             for obs in request.history:
                 agent.observe(obs)
         info = {**model.identity, **info}  # a session with an adapter returns both by itself
-        spent = timing(pending.arrived, call.began, call.ended)
+        spent = timing(pending, call.began, call.ended)
         require_serializable(info, self._reply_bytes)
         session.agent, session.instruction = agent, request.instruction or ""
         model.padding.record_reset(request, opening.kwargs)
@@ -581,7 +578,7 @@ class Engine:
         for (pending, session), result in zip(acting, results, strict=True):
             reply = build_reply(pending, session, result, model.contract, self._reply_bytes, weights.info)
             if reply.error is None:
-                reply.timing = timing(pending.arrived, call.began - prepared_s, call.ended)
+                reply.timing = timing(pending, call.began - prepared_s, call.ended)
                 reply.timing["batch_size"] = len(acting)
             if defer and (robots or pending.rank is not Rank.ROBOT):
                 unsent.append((pending, reply))

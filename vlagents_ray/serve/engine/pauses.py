@@ -87,15 +87,14 @@ class PauseDetector:
 
     def waited_s(self) -> float:
         """Return how long a request that was just read may have waited, s: 0 unless there was a pause."""
-        if (most_s := self._longest_wait_s()) == 0:
-            return 0.0
-        waited_s = _since_last_data_s()
-        return most_s if waited_s is None else waited_s
-
-    def _longest_wait_s(self) -> float:
         if self._checked is None:
             return 0.0
         now = self._clock()
         if now - self._checked > _PAUSE_S:  # this pause is not recorded yet
-            return now - (self._pause_began if self._checked < self._backlog_until else self._checked)
-        return now - self._pause_began if now < self._backlog_until else 0.0
+            began = self._pause_began if self._checked < self._backlog_until else self._checked
+        elif now < self._backlog_until:
+            began = self._pause_began
+        else:
+            return 0.0
+        waited_s = _since_last_data_s()
+        return now - began if waited_s is None else waited_s

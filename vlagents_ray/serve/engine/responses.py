@@ -95,15 +95,9 @@ def raised_at(error: Exception) -> str:
     return ""
 
 
-def timing(arrived: float, began: float, ended: float) -> dict[str, Any]:
-    """Return the durations that the engine measures, ms: the wait for the policy's call, and the call itself.
-
-    Args:
-        arrived: Time of the request's arrival, s, of the engine's clock.
-        began: Start of the policy's call, s.
-        ended: End of the call, s.
-    """
-    return {"queue_ms": (began - arrived) * 1e3, "inference_ms": (ended - began) * 1e3}
+def timing(pending: PendingRequest, began: float, ended: float) -> dict[str, Any]:
+    """Return how long a request waited for the policy's call, from `began` to `ended`, s, and how long it took, ms."""
+    return {"queue_ms": (began - pending.arrived) * 1e3, "inference_ms": (ended - began) * 1e3}
 
 
 def require_serializable(info: dict[str, Any], limit: int = DEFAULT_LIMITS.reply_bytes) -> None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
@@ -226,8 +226,10 @@ def _checked(document: object, source: str, step_follows: bool = False) -> Deplo
         config = Deployment.model_validate(document)
         if not config.plain or len(config.applications) > 1:
             config.for_serve()
-        for runtime_env in _runtime_envs(config):
-            require_no_secrets(runtime_env)
+        for one in config.applications:
+            require_no_secrets(one.runtime_env)
+            for stated in one.deployments:
+                require_no_secrets((stated.get("ray_actor_options") or {}).get("runtime_env") or {})
         for app in our_apps(config):
             args = ServerArgs(**app.args)
             # Relative paths refer to this process's folder, so Ray gets absolute ones.
@@ -240,14 +242,6 @@ def _checked(document: object, source: str, step_follows: bool = False) -> Deplo
         model = ServerArgs if error.title == ServerArgs.__name__ else Deployment
         raise ConfigError(f"{source}: {wrong_settings(error, model)}") from error
     return config
-
-
-def _runtime_envs(config: Deployment) -> Iterator[Mapping[str, Any]]:
-    """Yield the runtime environments of the applications and of their deployments."""
-    for app in config.applications:
-        yield app.runtime_env
-        for one in app.deployments:
-            yield (one.get("ray_actor_options") or {}).get("runtime_env") or {}
 
 
 def _require_policy(args: ServerArgs, own: dict[str, Any], *, installed: bool, step_follows: bool) -> None:

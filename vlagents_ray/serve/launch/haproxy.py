@@ -58,7 +58,6 @@ ROBOTS = {
     # HAProxy removes a leaving replica within a second; the default delays every stop by 30 s.
     "RAY_SERVE_DIRECT_INGRESS_MIN_DRAINING_PERIOD_S": "1",
 }
-NO_INGRESS = {"RAY_SERVE_ENABLE_HA_PROXY": "0"}  # settings of a cluster without HTTP
 
 
 @dataclass(frozen=True, slots=True)

@@ -79,9 +79,6 @@ def shut_down(client: Any) -> None:
     private.forget_serve(client)
 
 
-__all__ = ["Server", "deploy", "free_port", "running_server", "spread_over_gpus"]
-
-
 @dataclass(frozen=True, slots=True)
 class Server:
     """The addresses of a running server."""
@@ -308,7 +305,6 @@ def own_ray(
     Raises:
         ConfigError: The port is in use, or the environment excludes Ray's token or HAProxy's settings.
     """
-
     if os.environ.get(session.MODE, "token").lower() != "token":
         raise ConfigError(
             f"{session.MODE}={os.environ[session.MODE]}: a port of each replica, which runs whatever it is sent, "
@@ -325,7 +321,7 @@ def own_ray(
         ours = {MARK: str(folder), session.ALONE: "0", HOST: host if tls is None else LOOPBACK}
         listener = None
         if not ingress:
-            ours |= haproxy.NO_INGRESS
+            ours["RAY_SERVE_ENABLE_HA_PROXY"] = "0"
         elif (binary := haproxy.haproxy_binary()) is not None:
             if tls is not None or host not in (LOOPBACK, "localhost"):
                 bundle = None if tls is None else tls.bundle(folder)

@@ -79,7 +79,10 @@ class Padding:
             return []
         try:
             while len(self._rows) < missing:
-                self._rows.append(_DummySession(self._begin()))
+                agent = self._make()
+                obs, instruction, kwargs = copy.deepcopy(self._first)
+                agent.reset(obs, instruction, **kwargs)
+                self._rows.append(_DummySession(agent))
         except Exception:
             logger.exception("no padding for the batches: its session could not be reset")
             self._sizes.clear()
@@ -94,12 +97,6 @@ class Padding:
             row.acts += 1
         kept = [row for row, result in zip(used, results, strict=True) if isinstance(result, Act) and row.acts < _LIFE]
         self._rows[: len(results)] = kept
-
-    def _begin(self) -> Agent:
-        agent = self._make()
-        obs, instruction, kwargs = copy.deepcopy(self._first)  # type: ignore[misc]  # `sessions` has checked it
-        agent.reset(obs, instruction, **kwargs)
-        return agent
 
 
 @dataclass(slots=True, eq=False)

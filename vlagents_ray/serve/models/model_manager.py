@@ -100,10 +100,6 @@ class ModelCache:
         weights = [model.weights for model in self.loaded.values()]
         return {**self._source.describe(self.config), "loaded": loaded, "weights": weights, "swap": swap}
 
-    def offers(self, choice: CheckpointChoice, settings: Mapping[str, Any]) -> bool:
-        """Return whether the deployment offers that choice, and the choice has these settings."""
-        return self._source.offers(choice, settings, self.config)
-
     def find(self, choice: CheckpointChoice) -> LoadedModel | None:
         """Return the model that an episode of that choice would use now; None if it is not loaded."""
         return self.loaded.get(key_of(self._settings(choice)))
@@ -157,7 +153,7 @@ class ModelCache:
         self.draining = ""
         idle = [model for model in self.loaded.values() if not model.sessions]
         for model in idle:
-            if not self.offers(model.choice, model.settings):
+            if not self._source.offers(model.choice, model.settings, self.config):
                 return EvictTask(model.key)
         if (wanted := self._most_wanted()) is None:
             return None
@@ -368,7 +364,7 @@ class ModelManager:
             self._require_open()
             if (model := self._cache.loaded.get(key_of(settings))) is not None:
                 return self._cache.assign(session, model)
-            if timeout_s <= 0 or not self._cache.offers(choice, settings):
+            if timeout_s <= 0 or not self._source.offers(choice, settings, self.config):
                 raise UnknownSession(f"session {session.id!r}: {choice} is not loaded here; reset it")
         done = threading.Event()
         errors: list[VLAgentsError] = []

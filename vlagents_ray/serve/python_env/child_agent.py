@@ -58,10 +58,7 @@ class Child:
     """
 
     def __init__(self, python: str, settings: Settings, env_vars: Mapping[str, str]) -> None:
-        self.contract: Contract | None = None  # contract of the policy, set by `start`
-        self.weights: dict[str, Any] | None = None  # identity of the weights, set by `start`
-        self.continues_plans = False  # whether the policy's chunks continue a plan, set by `start`
-        self.trained: dict[str, Any] = {}  # the values that a learner trains, set by `start`: see `child_main`
+        self.loaded: dict[str, Any] = {}  # what the process says of the loaded policy: see `child_main`
         self.sessions: set[str] = set()  # names of the sessions in the child
         self._python, self._settings, self._env_vars = python, settings, env_vars
         self._process: subprocess.Popen[bytes] | None = None
@@ -91,15 +88,12 @@ class Child:
             raise ConfigError(f"environment.python: {self._python!r} cannot be started here ({spawned})") from spawned
         self._process = spawned
         try:
-            said = self._introduced(spawned, keeper)
-            self._transport = ShmTransport(said["local"])
+            self.loaded = self._introduced(spawned, keeper)
+            self._transport = ShmTransport(self.loaded["local"])
             self._transport.connect(_CONNECT_S)
         except BaseException:
             self.close()
             raise
-        self.contract = None if said["contract"] is None else Contract.from_json(said["contract"])
-        self.weights, self.continues_plans = said["weights"], said["continues_plans"]
-        self.trained = said["trained"]
         threading.Thread(target=self._close_sessions, name="policy-process-sessions", daemon=True).start()
 
     def call(self, requests: Sequence[Request]) -> list[Reply]:
@@ -274,11 +268,12 @@ class ChildAgent(Agent, HoldsWeights):
 
     @property
     def contract(self) -> Contract | None:
-        return self._child.contract
+        contract = self._child.loaded.get("contract")
+        return None if contract is None else Contract.from_json(contract)
 
     def initialize(self) -> None:
         self._child.start()
-        self.weights_id = self._child.weights
+        self.weights_id = self._child.loaded["weights"]
 
     def parameters(self) -> dict[str, Any]:
         raise NotTrainable("the weights are in the policy's own process; a server replaces them there")
@@ -305,7 +300,7 @@ class ChildAgent(Agent, HoldsWeights):
 
     @property
     def continues_plans(self) -> bool:
-        return self._child.continues_plans
+        return bool(self._child.loaded.get("continues_plans"))
 
     def check_health(self) -> None:
         self._child.require_alive()
@@ -345,7 +340,7 @@ class ChildWeights(ModelWeights):
     def __init__(
         self, agent: ChildAgent, child: Child, busy: threading.Lock, digest: str, model: tuple[str, str]
     ) -> None:
-        trained = child.trained
+        trained = child.loaded["trained"]
         super().__init__(agent, busy, trained.get("fingerprint", digest), model)
         self._child = child
         self._numbers = itertools.count(1)

@@ -20,7 +20,7 @@ import threading
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, fields
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 from vlagents_ray.errors import ConfigError, NotTrainable, PolicyFailed, PolicyUnavailable, VLAgentsError
 from vlagents_ray.interface import Agent
@@ -75,7 +75,10 @@ def run() -> None:
     die_with_parent()
     answers = own_stdout()  # printed text goes to the replica's log
     logging.basicConfig(level=logging.INFO, format="%(levelname)s %(name)s: %(message)s")
-    settings = Settings(**json.loads(_line()))
+    calls = os.fdopen(0, "rb", closefd=False)
+    if not (line := calls.readline()):
+        sys.exit(1)
+    settings = Settings(**json.loads(line))
     over = threading.Event()
 
     def answer(said: dict[str, Any]) -> None:
@@ -84,7 +87,7 @@ def run() -> None:
     def execute(call: dict[str, Any]) -> dict[str, Any]:
         return _executed(engine.weights, **call)
 
-    threading.Thread(target=_read_calls, args=[execute, answer, over], daemon=True).start()
+    threading.Thread(target=_read_calls, args=[calls, execute, answer, over], daemon=True).start()
     try:
         agent = build_agent(settings.policy, settings.config, settings.wrappers)
         engine = Engine(
@@ -129,16 +132,6 @@ def run() -> None:
     server.close()
 
 
-def _line() -> bytes:
-    """Read the first line of the standard input, and no byte after it."""
-    line = b""
-    while not line.endswith(b"\n"):
-        if not (byte := os.read(0, 1)):
-            sys.exit(1)
-        line += byte
-    return line
-
-
 def _trained(agent: Agent, updates: WeightUpdates) -> dict[str, Any]:
     """Return types and shapes of the values that a learner trains, by name, or the reason why there are none."""
     try:
@@ -149,25 +142,23 @@ def _trained(agent: Agent, updates: WeightUpdates) -> dict[str, Any]:
 
 
 def _read_calls(
+    calls: BinaryIO,
     execute: Callable[[dict[str, Any]], dict[str, Any]],
     answer: Callable[[dict[str, Any]], None],
     over: threading.Event,
 ) -> None:
     """Execute the calls that the replica writes, until it writes an empty line; then only the end of input is left."""
-    with os.fdopen(0, "rb", closefd=False) as calls:
-        while (line := calls.readline()) and not over.is_set():
-            if not line.strip():
-                over.set()
-                continue
-            try:
-                answer(execute(json.loads(line)))
-            except VLAgentsError as error:
-                answer({**problem(error), "not_shared": isinstance(error, NotShared)})
-            except Exception as error:
-                logging.getLogger(__name__).exception("a call for the weights failed")
-                answer(
-                    problem(PolicyFailed(f"weights: the policy raised {type(error).__name__}; see the server's log"))
-                )
+    while (line := calls.readline()) and not over.is_set():
+        if not line.strip():
+            over.set()
+            continue
+        try:
+            answer(execute(json.loads(line)))
+        except VLAgentsError as error:
+            answer({**problem(error), "not_shared": isinstance(error, NotShared)})
+        except Exception as error:
+            logging.getLogger(__name__).exception("a call for the weights failed")
+            answer(problem(PolicyFailed(f"weights: the policy raised {type(error).__name__}; see the server's log")))
     os._exit(1)
 
 

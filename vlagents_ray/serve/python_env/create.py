@@ -26,7 +26,6 @@ _US = "vlagents-ray"
 _FIXES = "vlagents_ray_import_fixes"  # a module and a .pth file in the environments created here
 _NOT_IN_A_WHEEL = {"RECORD", "INSTALLER", "REQUESTED", "direct_url.json"}  # files that an installer writes
 _SHOWN = 2000  # number of characters at the end of uv's output that an error quotes
-_MINOR = "import sys; print('%d.%d' % sys.version_info[:2])"
 _CUDA_12 = "torch<2.11"  # those whose wheels on PyPI are for CUDA 12
 _PYTHON = re.compile(r"^# python: (3\.\d+)\s*$", re.MULTILINE)
 _CUDA = re.compile(r"^ \+ ((?:nvidia|cuda)-\S+)", re.MULTILINE)
@@ -80,7 +79,7 @@ def find_python(version: str) -> str:
     uv = Path(os.environ.get("UV_PYTHON_INSTALL_DIR") or Path.home() / ".local/share/uv/python")
     installed = [*sorted(pyenv.glob(f"{version}.*/bin")), *sorted(uv.glob(f"cpython-{version}.*/bin"))]
     for one in [Path(sys.executable), *(folder / f"python{version}" for folder in [*folders, *installed])]:
-        if os.access(one, os.X_OK) and _is(one, version):
+        if os.access(one, os.X_OK) and _minor(one) == version:
             return str(one)
     raise ConfigError(
         f"found no Python {version}, which the requirements want: looked for python{version} on PATH, in {pyenv} "
@@ -133,10 +132,8 @@ def make_environment(
     if python is None and not python_in(folder).exists() and (wanted := _PYTHON.search(requirements.read_text())):
         python = find_python(wanted[1])
     made = create(folder, python, progress)
-    if not light and _minor(made) != _minor(Path(sys.executable)):
-        progress(
-            f"Python {_minor(made)} is not this one's {_minor(Path(sys.executable))}: without Ray, for a child process"
-        )
+    if not light and (theirs := _minor(made)) != (ours := _minor(Path(sys.executable))):
+        progress(f"Python {theirs} is not this one's {ours}: without Ray, for a child process")
         light = True
     with tempfile.TemporaryDirectory() as scratch:
         asked = [*_ourselves(light, Path(scratch))]
@@ -233,7 +230,8 @@ def require_no_cuda(python: Path, wanted: Sequence[str]) -> None:
 
 def _install_import_fixes(python: Path) -> None:
     """Install import fixes, with which torchvision and LeRobot load although their wheels do not fit this machine."""
-    folder = Path(_said_by(python, "import sysconfig; print(sysconfig.get_path('purelib'))"))
+    command = [str(python), "-c", "import sysconfig; print(sysconfig.get_path('purelib'))"]
+    folder = Path(subprocess.run(command, capture_output=True, text=True, check=True).stdout.strip())  # noqa: S603
     shutil.copyfile(str(import_fixes.__file__), folder / f"{_FIXES}.py")
     (folder / f"{_FIXES}.pth").write_text(f"import {_FIXES}; {_FIXES}.install()\n")
 
@@ -245,18 +243,9 @@ def has_gpu() -> bool:
 
 
 def _minor(python: Path) -> str:
-    return _said_by(python, _MINOR)
-
-
-def _is(python: Path, version: str) -> bool:
-    """Return whether an interpreter runs and has that minor version; a shim of pyenv may not run."""
-    done = subprocess.run([str(python), "-c", _MINOR], capture_output=True, text=True, check=False)  # noqa: S603
-    return done.returncode == 0 and done.stdout.strip() == version
-
-
-def _said_by(python: Path, program: str) -> str:
-    command = [str(python), "-c", program]
-    return subprocess.run(command, capture_output=True, text=True, check=True).stdout.strip()  # noqa: S603
+    """Return the minor version of an interpreter, such as "3.12"; "" if it does not run, as some shims of pyenv."""
+    command = [str(python), "-c", "import sys; print('%d.%d' % sys.version_info[:2])"]
+    return subprocess.run(command, capture_output=True, text=True, check=False).stdout.strip()  # noqa: S603
 
 
 def _uv(arguments: Sequence[str]) -> str:

@@ -42,11 +42,7 @@ class Exporter:
     """Exports an engine's stats to Ray once a second, on a separate thread, until `close`."""
 
     def __init__(
-        self,
-        engine: Engine,
-        tags: dict[str, str],
-        keys: Keys | None = None,
-        recorder: SessionRecorder | None = None,
+        self, engine: Engine, tags: dict[str, str], keys: Keys | None = None, recorder: SessionRecorder | None = None
     ) -> None:
         """Create the series of an engine with the `tags` application, deployment, replica and policy.
 

@@ -90,7 +90,11 @@ class PolicyReplica(ClientApi, SiblingApi):
         self._peers = SiblingReplicas()
         self._migrator = SessionMigrator(self._peers.others, asyncio.get_running_loop())
         self._limits = settings.limits.limits()
-        self._engine = _engine(settings, self._migrator)
+        if 0 < settings.resources.num_gpus < 1:
+            os.environ.setdefault(GPU_SHARE, str(settings.resources.num_gpus))
+        if VISIBLE not in settings.environment.env_vars:
+            hide_gpus(ray.get_runtime_context().get_accelerator_ids().get("GPU", []))
+        self._engine = build_engine(settings, settings.config, self._migrator)
         self._configured = False
         self._migrator.start(self._engine)
         self._rebalancer = Rebalancer(self._engine, self._peers, self._load_of)
@@ -340,15 +344,6 @@ class PolicyReplica(ClientApi, SiblingApi):
                 self._gateways = {}
                 logger.info("the gateway does not say where it listens: %s", error)
             await asyncio.sleep(_GATEWAY_POLL_S)
-
-
-def _engine(args: ServerArgs, migrator: SessionMigrator) -> Engine:
-    """Create the engine, without loading the policy."""
-    if 0 < args.resources.num_gpus < 1:
-        os.environ.setdefault(GPU_SHARE, str(args.resources.num_gpus))
-    if VISIBLE not in args.environment.env_vars:
-        hide_gpus(ray.get_runtime_context().get_accelerator_ids().get("GPU", []))
-    return build_engine(args, args.config, migrator)
 
 
 def _stream_endpoint(engine: Engine, args: ServerArgs, admit: Admit | NoKey) -> WebSocketServer:

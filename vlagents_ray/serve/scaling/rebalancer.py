@@ -13,7 +13,7 @@ import asyncio
 import logging
 import random
 import time
-from collections import deque
+from collections import Counter, deque
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from operator import attrgetter
@@ -83,17 +83,17 @@ def excess_sessions(mine: int, others: Iterable[int], leaving: int = 0) -> int:
     return mine - leaving - -(-sum(loads) // len(loads))
 
 
-def choose_connections(connections: Sequence[int], count: int) -> list[int]:
-    """Choose the connections to send away, given the number of sessions of each, and return their indices.
+def choose_connections(connections: Counter[str], count: int) -> set[str]:
+    """Choose the connections to send away, given the number of sessions of each.
 
     At most `count` sessions leave. All sessions of a connection move together, so a connection with more sessions
     stays.
     """
-    chosen = []
-    for index in sorted(range(len(connections)), key=lambda i: -connections[i]):
-        if connections[index] <= count:
-            chosen.append(index)
-            count -= connections[index]
+    chosen = set()
+    for connection, sessions in connections.most_common():
+        if sessions <= count:
+            chosen.add(connection)
+            count -= sessions
     return chosen
 
 
@@ -201,8 +201,7 @@ class Rebalancer:
             drain_list.mark(set())
         else:
             lately = drain_list.asked_within(_RECONNECT_S)
-            groups = [group for group in active if group not in lately]
-            chosen = choose_connections([active[group] for group in groups], min(too_many, _AT_ONCE))
-            drain_list.mark({groups[index] for index in chosen})
+            movable = Counter({group: count for group, count in active.items() if group not in lately})
+            drain_list.mark(choose_connections(movable, min(too_many, _AT_ONCE)))
             logger.info("%d sessions, %d more than a fair share: sending some away", mine.sessions, too_many)
         self._uneven = too_many > 0

@@ -145,28 +145,27 @@ class HeldSessions:
 
     # Operations for this replica.
 
-    async def send_to_peer(self, session_id: str, peers: Sequence[Peer]) -> bool:
-        """Give the session to the first of `peers` that takes it over; return whether one did.
+    async def send_to_peer(self, session_id: str, peers: Sequence[Peer]) -> None:
+        """Give the session to the first of `peers` that takes it over.
 
         The next replica gets a request only if the previous one refused or has ended.
         """
         state = await self._ask(session_id, "export", None)  # no time limit: otherwise the session would end here
         if state is None or not peers:
-            return False
+            return
         self._leaving[session_id] = self._loop.create_future()
         try:
             if not await self._release(session_id, (state["steps"], state["moves"]), None):
-                return False
+                return
             for peer in peers:
                 try:
                     if await peer.ask(HeldSessions.take_over, session_id, state):
-                        return True
+                        return
                 except PeerEnded:
                     continue
                 except PeerUnreachable as error:
                     logger.warning("session %s: given to a replica that does not answer: %s", session_id, error)
-                    return False
-            return False
+                    return
         finally:
             self._leaving.pop(session_id).set_result(None)
 
@@ -282,19 +281,15 @@ class SessionMigrator:
                 return
         self._loop.call_soon_threadsafe(lambda: self._spawn(self._announce_all()))
 
-    async def hand_over(self) -> int:
-        """Give all sessions to other replicas, since this one stops, and close the queue.
-
-        Returns:
-            The number of sessions that other replicas took over.
-        """
+    async def hand_over(self) -> None:
+        """Give all sessions to other replicas, since this one stops, and close the queue."""
         slots = asyncio.Semaphore(_AT_ONCE)
 
-        async def transfer(session_id: str, peers: Sequence[Peer]) -> bool:
+        async def transfer(session_id: str, peers: Sequence[Peer]) -> None:
             async with slots:
-                return await self.held.send_to_peer(session_id, peers)
+                await self.held.send_to_peer(session_id, peers)
 
-        taken, tried = 0, set[tuple[str, Version]]()
+        tried = set[tuple[str, Version]]()
         while True:
             here = sorted(self._engine.sessions.versions().items() - tried)
             if not here and not self._callbacks:
@@ -303,12 +298,11 @@ class SessionMigrator:
             peers = await self._responsive_first() if here else []
             orders = [peers[i:] + peers[:i] for i in range(max(1, len(peers)))]  # round-robin over the replicas
             transfers = [transfer(session_id, orders[i % len(orders)]) for i, (session_id, _) in enumerate(here)]
-            taken += sum(await asyncio.gather(*transfers))
+            await asyncio.gather(*transfers)
             if not here:  # sessions are still being fetched for earlier requests
                 await asyncio.sleep(ON_ITS_WAY_S)
         self._closed = True
         self._engine.stop(0.0)  # later requests are refused, so that clients send them to the new replica
-        return taken
 
     async def _responsive_first(self) -> list[Peer]:
         """Return the other replicas; those that do not answer at once are last."""

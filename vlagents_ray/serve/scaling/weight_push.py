@@ -44,7 +44,6 @@ class ThisReplica(WeightsReplica):
     """The local replica as the target of a push."""
 
     def __init__(self, name: str, updates: WeightUpdates) -> None:
-        """Set the updates of this replica's engine."""
         self.name, self._updates = name, updates
 
     async def weights(self, method: Callable[..., T], *args: Any) -> T:
@@ -63,7 +62,7 @@ class WeightPusher:
         self._known: set[str] = set()  # names of replicas that have answered
 
     async def push(self, values: Values, options: PushOptions) -> PushResult:
-        """Pushes new weights to all replicas, on the event loop of one of them."""
+        """Make all replicas act with new weights, or none of them."""
         begun = time.perf_counter()
         async with self._pushing:
             newest = {
@@ -132,8 +131,8 @@ class WeightPusher:
                 raise _unreachable(replica) from error
             raise error
 
-    async def catch_up(self) -> int:
-        """Get the newest versions of the other replicas if they are newer; then return this replica's newest version.
+    async def catch_up(self) -> None:
+        """Get the newest versions of the other replicas if they are newer than this replica's.
 
         A replica calls this before it is ready, and regularly, since it may have missed a commit.
         """
@@ -148,14 +147,13 @@ class WeightPusher:
                 if newest.number > best.number and newest.model == own.model:
                     best, source = newest, replica
             if source is None:
-                return own.number
+                return
             for version in await source.weights(WeightUpdates.held):
                 if version.number > own.number:
                     options = PushOptions(allow_same=True, pin=version.pinned)
                     await self._own.weights(WeightUpdates.stage, version.number, version.values, options)
                     await self._own.weights(WeightUpdates.commit, version.number, options)
             logger.info("took version %d of the weights from %s", best.number, source.name)
-            return (await self._own.weights(WeightUpdates.newest)).number
 
     async def _commit(self, replica: WeightsReplica, number: int, options: PushOptions) -> bool:
         """Commit at one replica, and return whether it acts with the version; otherwise it will catch up."""
