@@ -37,10 +37,6 @@ class LoadingReport:
         """Whether a model computes on another device than a CPU."""
         return any(device["kind"] != "cpu" for device in self.devices)
 
-    def record_pass(self, rows: int, duration_s: float) -> None:
-        """Record the duration of a forward pass."""
-        self.pass_s[rows] = min(duration_s, self.pass_s.get(rows, duration_s))
-
 
 _report: ContextVar[LoadingReport | None] = ContextVar("_report", default=None)
 

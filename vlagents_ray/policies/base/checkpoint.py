@@ -180,11 +180,6 @@ class SavedTensors:
     def __getitem__(self, name: str) -> Any:
         return self._readers[name]()
 
-    def renamed(self, rename: Callable[[str], str | None]) -> SavedTensors:
-        """Return the tensors under other names; those that `rename` maps to None are dropped."""
-        named = {rename(key): reader for key, reader in self._readers.items()}
-        return SavedTensors({key: reader for key, reader in named.items() if key is not None})
-
 
 def _safetensors(folder: Path) -> list[Path]:
     for index in sorted(folder.glob(f"*{_INDEX}")):

@@ -275,12 +275,11 @@ class ModelPolicy(Agent, abc.ABC):
     def _load_with_adapters(self) -> Any:
         with used_checkpoints() as base:
             self.model = self.load()
-        weights = weights_of(base) or {"digest": ""}
-        find = partial(
-            find_adapter, checkpoint=self.config.checkpoint, base=base, digest_of_base=weights["digest"] or ""
-        )
+        weights = weights_of(base) or {}
+        digest = weights.get("digest") or ""
+        find = partial(find_adapter, checkpoint=self.config.checkpoint, base=base, digest_of_base=digest)
         self.adapters.load(attrgetter(self.network or "")(self), self.config.adapters, find, self.adapt)
-        self.adapters.base = (weights["digest"] or "").rpartition(":")[2][:DIGITS]
+        self.adapters.base = digest.rpartition(":")[2][:DIGITS]
         self.weights_id = {**weights, "adapters": self.adapters.ids} if base else None
         return self.model
 
@@ -407,7 +406,8 @@ class ModelPolicy(Agent, abc.ABC):
             began = time.perf_counter()
             with self.report.timer():
                 results = self.predict(filled)
-            self.report.record_pass(len(filled), time.perf_counter() - began)
+            shortest, took = self.report.pass_s, time.perf_counter() - began
+            shortest[len(filled)] = min(took, shortest.get(len(filled), took))
             if len(results) != len(filled):
                 raise PolicyFailed(f"predict: got {len(filled)} rows, returned {len(results)} chunks")
             found += results[: len(part)]
@@ -428,7 +428,9 @@ class ModelPolicy(Agent, abc.ABC):
 
     def _run_examples(self, size: int, seeds: Iterator[int]) -> None:
         rows = [self._example(next(seeds)) for _ in range(size)]
-        self._chunks(rows)
+        for prediction in self._forward(rows):
+            if isinstance(prediction, Exception):
+                raise prediction
         if any("jax" in device for device in self.report.devices) and size <= self.most_rows:
             for few in (few for few in self.config.batch_sizes or () if few < size):  # JAX compiles for each such pair
                 self.predict([*rows[:few], *(drawn(rows[0], row.rng) for row in rows[few:])])  # its duration is another
@@ -441,15 +443,6 @@ class ModelPolicy(Agent, abc.ABC):
         firsts, owners = shared_frames(rows)
         firsts, each = self.padded(firsts), list(range(len(rows)))
         return (each, each) if len(firsts) == len(rows) else (firsts, owners)
-
-    def _chunks(self, rows: Sequence[Row]) -> list[np.ndarray]:
-        """Return the chunks of rows; raises the first error of a row."""
-        chunks = []
-        for prediction in self._forward(list(rows)):
-            if isinstance(prediction, Exception):
-                raise prediction
-            chunks.append(prediction.actions)
-        return chunks
 
     def _example(self, seed: int, instruction: str = "warm up") -> Row:
         """Return a row for the warm-up: random images, and a random state near zero, that fit the contract."""
