@@ -239,34 +239,6 @@ class Guide:
         return self.frozen * (noise - self.plan) + (1.0 - self.frozen) * pulled
 
 
-def start_flow(
-    rows: Sequence[Row],
-    shape: tuple[int, int],
-    steps: int,
-    *,
-    noise_level: float,
-    limit: float,
-    convert: Callable[[np.ndarray], Any],
-) -> tuple[Any, list[Change], RandomSteps | None]:
-    """Draw the noise of a batch's flow.
-
-    Args:
-        rows: Those of the batch, with plans in the model's units.
-        shape: The rows and numbers of a chunk, (H, D).
-        steps: The number of steps.
-        noise_level: See `step_mean`.
-        limit: See `Guide.steer`.
-        convert: Makes a tensor of an array, on the model's device.
-
-    Returns:
-        The noise (B, H, D), the changes for `follow`, and the random steps, if any row wants them.
-    """
-    noise = convert(np.stack([row.noise(*shape) for row in rows]))  # before that of the steps, which some rows draw
-    guide, random = Guide.of(rows, *shape), RandomSteps.of(rows, (steps, *shape), noise_level, convert)
-    changes = [] if guide is None else [guide.to(convert).change(noise, steps=steps, limit=limit)]
-    return noise, changes if random is None else [*changes, random.change], random
-
-
 def _weights(delay: int, length: int, horizon: int) -> np.ndarray:
     """Return (horizon,): the paper's soft mask, from about 1 after the frozen rows down to 0 where the plan ends."""
     behind = np.arange(horizon, dtype=np.float32)
@@ -307,6 +279,41 @@ class FlowPasses(abc.ABC):
     @abc.abstractmethod
     def velocity(self, encoded: Any, seen: Any, state: Any, actions: Any, times: Any) -> Any:
         """Return the velocity (B, H, D) of noisy actions (B, H, D) at times (B,), or (B, H) with `by_row`."""
+
+    def chunks(
+        self,
+        rows: Sequence[Row],
+        inputs: Sequence[Any],
+        owners: Sequence[int],
+        *,
+        shape: tuple[int, int],
+        steps: int,
+        config: Any,
+        dim: int,
+        convert: Callable[[np.ndarray], Any],
+    ) -> tuple[np.ndarray, dict[int, dict[str, Any]]]:
+        """Return actions (B, H, D) in the model's units, and the outputs requested of rows, by their places.
+
+        Args:
+            rows: Those of the batch, with plans in the model's units.
+            inputs: The first five arguments of `sample`.
+            owners: The observation of each row.
+            shape: The rows and numbers of a chunk, (H, D).
+            steps: The number of steps.
+            config: The policy's `noise_level`, `guidance` and `execute`.
+            dim: How many of the numbers are the robot's.
+            convert: Makes a tensor of an array, on the model's device.
+        """
+        noise = convert(np.stack([row.noise(*shape) for row in rows]))  # before that of the steps, which some rows draw
+        guide, random = Guide.of(rows, *shape), RandomSteps.of(rows, (steps, *shape), config.noise_level, convert)
+        changes: list[Change] = []
+        if guide is not None:
+            changes.append(guide.to(convert).change(noise, steps=steps, limit=config.guidance))
+        if random is not None:
+            changes.append(random.change)
+        fingerprints = [row.adapter for row in rows]
+        flow = self.sample(*inputs, noise=noise, owners=owners, steps=steps, changes=changes, fingerprints=fingerprints)
+        return fetch(flow), {} if random is None else random.stated(config.execute, dim)
 
     def sample(
         self,

@@ -14,11 +14,11 @@ from vlagents_ray.contract import ActionSpec, Contract
 from vlagents_ray.errors import ConfigError
 from vlagents_ray.interface import Obs
 from vlagents_ray.policies.base import ModelConfig, ModelPolicy, Prediction, Row, model_inputs, shared_frames
-from vlagents_ray.policies.base.accelerator import fetch, torch_device, torch_dtype
+from vlagents_ray.policies.base.accelerator import torch_device, torch_dtype
 from vlagents_ray.policies.base.checkpoint import find_checkpoint
 from vlagents_ray.policies.base.config import Guidance, NoiseLevel
 from vlagents_ray.policies.base.staging import StagedRow, Staging
-from vlagents_ray.policies.flow import OFFERED, FlowPasses, start_flow
+from vlagents_ray.policies.flow import OFFERED, FlowPasses
 from vlagents_ray.policies.reference.checkpoint import (
     CAMERAS,
     CONFIG,
@@ -79,17 +79,9 @@ class Reference(ModelPolicy):
     def contract(self) -> Contract:
         if self.model is None:
             return Contract(instruction=True, history=1)
-        robot = self.model.robot
-        return Contract(
-            cameras=model_inputs.camera_specs(self.model.cameras),
-            state=model_inputs.state_specs(self.state, len(robot.state_mean)),
-            gripper=model_inputs.needs_gripper(self.state),
-            instruction=True,
-            action=ActionSpec(**robot.action),
-            chunk=self.chunk(self.model.checkpoint.sizes.horizon),
-            history=1,
-            behaviour=self.offered(OFFERED if self.config.noise_level else ()),
-        )
+        model, behaviour = self.model, self.offered(OFFERED if self.config.noise_level else ())
+        action, horizon = ActionSpec(**model.robot.action), model.checkpoint.sizes.horizon
+        return self.stated(model.cameras, self.state, horizon, action=action, behaviour=behaviour)
 
     @property
     def state_dim(self) -> int | None:
@@ -138,34 +130,23 @@ class Reference(ModelPolicy):
         return staged
 
     def predict(self, rows: Sequence[Row]) -> list[Prediction]:
-        model, config, torch = self.loaded(), self.config, require("torch")
-        shape = (model.checkpoint.sizes.horizon, model.checkpoint.sizes.action)
-        noise, changes, random = start_flow(
-            rows,
-            shape,
-            config.steps,
-            noise_level=config.noise_level,
-            limit=config.guidance,
-            convert=model.staging.upload,
-        )
-        firsts, owners = shared_frames(rows)
+        model, torch, (firsts, owners) = self.loaded(), require("torch"), shared_frames(rows)
+        sizes = model.checkpoint.sizes
         with torch.inference_mode():
             inputs = self._inputs([rows[i] for i in firsts])
             tokens = inputs["tokens"]
-            flow = model.passes.sample(
-                inputs["images"].unbind(1),
-                [torch.ones(len(tokens), dtype=torch.bool, device=tokens.device)] * len(CAMERAS),
-                tokens,
-                tokens != 0,
-                inputs["state"],
-                noise=noise,
-                owners=owners,
-                steps=config.steps,
-                changes=changes,
-                fingerprints=[row.adapter for row in rows],
+            cameras = [torch.ones(len(tokens), dtype=torch.bool, device=tokens.device)] * len(CAMERAS)
+            flows, stated = model.passes.chunks(
+                rows,
+                [inputs["images"].unbind(1), cameras, tokens, tokens != 0, inputs["state"]],
+                owners,
+                shape=(sizes.horizon, sizes.action),
+                steps=self.config.steps,
+                config=self.config,
+                dim=sizes.action,
+                convert=model.staging.upload,
             )
-            stated = {} if random is None else random.stated(config.execute, shape[1])
-        return [Prediction(one, behaviour=stated.get(i, {})) for i, one in enumerate(fetch(flow))]
+        return [Prediction(flow, behaviour=stated.get(i, {})) for i, flow in enumerate(flows)]
 
     def _inputs(self, rows: Sequence[Row]) -> dict[str, Any]:
         """Stack the last frames of rows, in the type of the network."""
