@@ -82,17 +82,11 @@ ROBOTS: Mapping[str, RobotConvention] = {  # by the class of openpi's observatio
     "AlohaInputs": _ALOHA,
 }
 _ENDS = ("q01", "q99")  # the statistics by which a robot is compared with the training
-_ALOHA_SIM = {"images.cam_high": "front"}  # the simulation has one camera
 
 
-def choose_robot(
-    config: str,
-    transform: str,
-    cameras: Mapping[str, str] | None,
-    state: Mapping[str, Mapping[str, int]] | None,
-    layout: Layout | None,
-) -> RobotConvention:
+def choose_robot(config: str, transform: str, settings: OpenPiConfig) -> RobotConvention:
     """Return the convention of a config's robot, overridden by the settings; raises `ConfigError` if it is unknown."""
+    cameras, state = settings.cameras, settings.state
     if (usual := ROBOTS.get(transform)) is None:
         if cameras is None or state is None:
             raise ConfigError(
@@ -101,13 +95,13 @@ def choose_robot(
             )
         usual = RobotConvention(cameras, {})
     if cameras is None and config == "pi0_aloha_sim":
-        cameras = _ALOHA_SIM
+        cameras = {"images.cam_high": "front"}  # the simulation has one camera
     known = [key for key in usual.cameras if key not in usual.optional or cameras is None or key in cameras]
     return replace(
         usual,
         cameras=choose_cameras(cameras, usual.cameras, known),
         state=usual.state if state is None else state,
-        layout=layout or usual.layout,
+        layout=settings.layout or usual.layout,
     )
 
 
@@ -126,7 +120,9 @@ class Transforms:
     def of(cls, config: Any, folder: Path) -> Transforms:
         """Read the transforms; raises `ConfigError` if the checkpoint lacks statistics of the config's asset."""
         openpi = require("openpi.transforms")
-        data = _data_config(config, folder)
+        # with the checkpoint's statistics: openpi itself would first look online
+        here = dataclasses.replace(config.data.assets, assets_dir=str(folder / "assets"))
+        data = dataclasses.replace(config.data, assets=here).create(config.assets_dirs, config.model)
         statistics = _statistics(folder, data.asset_id)
         quantiles = data.use_quantile_norm
         try:
@@ -198,13 +194,6 @@ def _with(observation: dict[str, Any], instruction: str) -> dict[str, Any]:
     """Copy an observation as deeply as openpi's transforms modify it."""
     data: dict[str, Any] = require("jax").tree.map(np.array, observation)
     return data | {"prompt": instruction} if instruction else data
-
-
-def _data_config(config: Any, folder: Path) -> Any:
-    """Return the config's data config with the checkpoint's statistics; openpi itself would first look online."""
-    factory = config.data
-    here = dataclasses.replace(factory.assets, assets_dir=str(folder / "assets"))
-    return dataclasses.replace(factory, assets=here).create(config.assets_dirs, config.model)
 
 
 def _statistics(folder: Path, asset: str | None) -> Any:
@@ -509,15 +498,6 @@ class SeenObs:
     inputs: dict[str, Any]
 
 
-@dataclass(frozen=True)
-class TransformedRow:
-    """A row in the form of the model's inputs."""
-
-    inputs: dict[str, Any]
-    row: Row  # with its leftover actions in the model's units
-    noise: np.ndarray
-
-
 class OpenPi(ModelPolicy):
     """The policies of openpi, with one call of the model for many sessions."""
 
@@ -552,8 +532,7 @@ class OpenPi(ModelPolicy):
         config = train_config(self.config.config)
         folder = self._folder()
         transforms = Transforms.of(config, folder)
-        ours = self.config
-        robot = choose_robot(config.name, transforms.robot, ours.cameras, ours.state, ours.layout)
+        robot = choose_robot(config.name, transforms.robot, self.config)
         found = attempt(transforms.ranges, robot)  # a transform of the user's own may want more of an observation
         if isinstance(found, Exception):
             logger.warning("the statistics of the training are not stated: %s: %s", type(found).__name__, found)
@@ -584,36 +563,36 @@ class OpenPi(ModelPolicy):
         if (spare := next((one for one in read if not isinstance(one, Exception)), None)) is None:
             return read  # errors all
         # A valid row replaces an invalid one, so that the number of rows stays one that is compiled.
-        spare = replace(spare, row=replace(spare.row, want=()))
-        flows, stated = self._sample([spare if isinstance(one, Exception) else one for one in read])
+        spare = replace(spare[0], want=()), spare[1]
+        rows, noise = zip(*(spare if isinstance(one, Exception) else one for one in read), strict=True)
+        flows, stated = self._sample(rows, np.stack(noise))
         actions = self.loaded().transforms.actions
         return [
             one
             if isinstance(one, Exception)
-            else Prediction(actions(one.inputs["state"], flow), behaviour=stated.get(i, {}))
-            for i, (one, flow) in enumerate(zip(read, flows, strict=True))
+            else Prediction(actions(row.frames[-1].inputs["state"], flow), behaviour=stated.get(i, {}))
+            for i, (one, row, flow) in enumerate(zip(read, rows, flows, strict=True))
         ]
 
-    def _planned(self, row: Row) -> TransformedRow:
-        """Return the row with its leftover actions in the model's units."""
-        loaded, seen = self.loaded(), row.frames[-1]
+    def _planned(self, row: Row) -> tuple[Row, np.ndarray]:
+        """Return the row with its leftover actions in the model's units, and its noise."""
+        loaded = self.loaded()
         if row.leftover is not None:
-            row = replace(row, leftover=loaded.transforms.plan(seen.raw, row.instruction, row.leftover))
-        return TransformedRow(seen.inputs, row, row.noise(*loaded.model.noise_shape or ()))
+            plan = loaded.transforms.plan(row.frames[-1].raw, row.instruction, row.leftover)
+            row = replace(row, leftover=plan)
+        return row, row.noise(*loaded.model.noise_shape or ())
 
-    def _sample(self, ready: Sequence[TransformedRow]) -> tuple[np.ndarray, dict[int, dict[str, Any]]]:
+    def _sample(self, rows: Sequence[Row], noise: np.ndarray) -> tuple[np.ndarray, dict[int, dict[str, Any]]]:
         """Return the model's output for rows, and the requested extra outputs by the index of the row."""
-        model, rows = self.loaded().model, [one.row for one in ready]
+        model, shape = self.loaded().model, self.loaded().model.noise_shape
         each = list(range(len(rows)))
         firsts, owners = self.observations_of(rows) if model.shares else (each, each)
-        batch = require("jax").tree.map(lambda *leaves: np.stack(leaves), *(ready[i].inputs for i in firsts))
-        shape = model.noise_shape
+        inputs = (rows[i].frames[-1].inputs for i in firsts)
+        batch = require("jax").tree.map(lambda *leaves: np.stack(leaves), *inputs)
         guide = None if shape is None else Guide.of(rows, *shape)
         random = model.random_steps(rows, self.config.noise_level)
-        noise = np.stack([one.noise for one in ready])
         flows = model.sample(SampleBatch(batch, noise, guide, owners, random))
-        dim = self.loaded().robot.action.dim
-        return flows, {} if random is None else random.stated(self.config.execute, dim)
+        return flows, {} if random is None else random.stated(self.config.execute, self.loaded().robot.action.dim)
 
     def _folder(self) -> Path:
         name, step = self.config.checkpoint, self.config.checkpoint_step

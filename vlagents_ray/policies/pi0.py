@@ -186,13 +186,10 @@ class Pi0(ModelPolicy):
         with require("torch").inference_mode():
             inputs = self._inputs([rows[i] for i in firsts])
             cameras = inputs["pixel_attention_mask"].unbind(1)
+            others = (inputs[name] for name in ("input_ids", "attention_mask", "state"))
             flows, stated = model.passes.chunks(
                 [model.planned(row) for row in rows],
-                [
-                    [inputs["pixel_values"]],
-                    cameras,
-                    *(inputs[name] for name in ("input_ids", "attention_mask", "state")),
-                ],
+                [[inputs["pixel_values"]], cameras, *others],
                 owners,
                 shape=(settings.chunk_size, settings.max_action_dim),
                 steps=self.config.steps or settings.num_inference_steps,
