@@ -8,7 +8,6 @@ adapter use one of zeros. S-LoRA (arXiv 2311.03285) and Punica (arXiv 2310.18547
 
 from __future__ import annotations
 
-import hashlib
 import json
 import math
 import struct
@@ -37,12 +36,6 @@ class Adapter:
     weights: str = ""  # digest of the base's files and the adapter's
     fingerprint: str = ""  # the beginning of that digest; empty: the session acts with the base alone
     revision: str | None = None  # the hub's commit of the adapter
-
-    @classmethod
-    def of(cls, source: str, base: str, own: str, revision: str | None = None) -> Adapter:
-        """Make an adapter from its source and commit, and from the digests of the base and of its own files."""
-        digest = hashlib.sha256(f"{base} {own}".encode()).hexdigest()
-        return cls(source, f"{own.partition(':')[0]}:{digest}", digest[:DIGITS], revision)
 
     @property
     def identity(self) -> dict[str, Any]:

@@ -10,7 +10,7 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from vlagents_ray.contract import CameraSpec, Contract, StateSpec
+from vlagents_ray.contract import Contract, StateSpec
 from vlagents_ray.errors import ConfigError, InvalidObservation, MissingCamera, MissingState
 from vlagents_ray.interface import LEFTOVER, SAMPLES, WANT, Obs
 from vlagents_ray.policies.base.config import ModelConfig
@@ -119,11 +119,6 @@ def state_vector(obs: Obs, parts: Sequence[str], dim: int | None = None) -> np.n
             f"set the policy's `state` to the parts that it was trained with"
         )
     return vector
-
-
-def camera_specs(cameras: Mapping[str, str]) -> dict[str, CameraSpec]:
-    """Return the cameras of a contract: images of any size, which the adapter resizes as its family does."""
-    return {ours: CameraSpec() for ours in cameras.values()}
 
 
 def needs_gripper(parts: Sequence[str]) -> bool:

@@ -18,8 +18,8 @@ from typing import Any, ClassVar, TypeVar
 import numpy as np
 
 from vlagents_ray.chunking.buffer import ENSEMBLE, Chunk, ChunkBuffer
-from vlagents_ray.contract import Contract
-from vlagents_ray.errors import ConfigError, InvalidAction, InvalidObservation, NotReset, PolicyFailed
+from vlagents_ray.contract import CameraSpec, Contract
+from vlagents_ray.errors import ConfigError, InvalidAction, InvalidObservation, NotReset, NotTrainable, PolicyFailed
 from vlagents_ray.interface import BEHAVIOUR, DELAY, DISTRIBUTION, EXECUTED, LEFTOVER, Act, Agent, Obs
 from vlagents_ray.policies.adapters import ADAPTER, DIGITS, Adapters
 from vlagents_ray.policies.base.accelerator import free_memory, gpu_timer, is_out_of_memory, set_matmul
@@ -28,7 +28,6 @@ from vlagents_ray.policies.base.checkpoint_files import weights_of
 from vlagents_ray.policies.base.config import ModelConfig
 from vlagents_ray.policies.base.model_inputs import (
     Row,
-    camera_specs,
     count_in,
     drawn,
     leftover_plan,
@@ -38,7 +37,7 @@ from vlagents_ray.policies.base.model_inputs import (
     wanted_behaviour,
     wanted_samples,
 )
-from vlagents_ray.policies.compilation import Compilation, quantize, require_whole
+from vlagents_ray.policies.compilation import Compilation, quantize
 from vlagents_ray.policies.loading import COMPILED_SIZES, LoadingReport, current_report, report_progress
 from vlagents_ray.policies.outcomes import attempt
 from vlagents_ray.validation import check_action
@@ -137,7 +136,7 @@ class ModelPolicy(Agent, abc.ABC):
             facts: Further fields of the contract, or other values of these.
         """
         usual: dict[str, Any] = {
-            "cameras": camera_specs(cameras),
+            "cameras": {ours: CameraSpec() for ours in cameras.values()},  # of any size: families resize them
             "state": state_specs(parts, self.state_dim),
             "gripper": needs_gripper(parts),
             "instruction": True,
@@ -258,7 +257,10 @@ class ModelPolicy(Agent, abc.ABC):
         self.model, self.adapters, self.compilation = None, Adapters(), Compilation(self.config.compile)
 
     def _trainable(self) -> Any:
-        require_whole(self.config.quantization)
+        if (kind := self.config.quantization) is not None:
+            raise NotTrainable(
+                f"quantization {kind!r}: weights of 8 bits cannot be replaced by a learner's; leave it out"
+            )
         return self.adapters.trainable if self.config.adapters else super()._trainable()
 
     def adapt(self, adapter: str, folder: Path) -> None:
