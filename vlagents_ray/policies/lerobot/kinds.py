@@ -184,7 +184,6 @@ class Flow(Kind):
 
     def __init__(self, policy: Any, compilation: Compilation) -> None:
         super().__init__(policy, compilation)
-        self.guidance = Guidance(policy.rtc_processor)
         model = policy.model
         if policy.name == "smolvla":
             self.passes: FlowPasses = SmolVLAPasses(model, compilation)
@@ -228,7 +227,8 @@ class Flow(Kind):
                 noise, given = prefixes.given(noise), prefixes.frozen
                 changes.append(prefixes.keep)
             else:
-                changes.append(self.guidance.towards(plans, [row.delay for row in rows], shape, convert))
+                delays = [row.delay for row in rows]
+                changes.append(guided(self.policy.rtc_processor, plans, delays, shape, convert))
         if self.random is not None:
             changes.append(self.random.change)
         return self.policy.predict_action_chunk(
@@ -259,39 +259,33 @@ class Flow(Kind):
         return self.policy._pi_aloha_encode_actions_inv(left[None].clone())[0]
 
 
-class Guidance:
-    """Guides chunks like the `RTCProcessor` of a LeRobot flow-matching policy, with the settings of that processor."""
+def guided(processor: Any, plans: Sequence[Any], delays: Sequence[int], shape: tuple[int, int], convert: Any) -> Change:
+    """Return the change of velocities that leads chunks to the leftovers of their sessions, as LeRobot does.
 
-    def __init__(self, processor: Any) -> None:
-        self._processor = processor  # supplies settings and schedule
+    Args:
+        processor: The policy's `RTCProcessor`, for its settings and its schedule.
+        plans: The leftover of each of the B rows in the policy's units, (H', D'), or None.
+        delays: For each row, the number of actions that will have been executed.
+        shape: Rows and numbers of a chunk, (H, D).
+        convert: Makes a tensor of an array, on the policy's device.
+    """
+    torch, settings = require("torch"), processor.rtc_config
+    target, weights = torch.zeros(len(plans), *shape), torch.zeros(len(plans), shape[0], 1)
+    for i, (plan, delay) in enumerate(zip(plans, delays, strict=True)):
+        if plan is not None:
+            part = plan[: shape[0]]
+            target[i, : len(part), : part.shape[1]] = part
+            horizon = min(settings.execution_horizon, len(part))
+            weights[i, :, 0] = processor.get_prefix_weights(max(delay, 0), horizon, shape[0])
+    target, weights = convert(target.numpy()), convert(weights.numpy())
+    most = float(settings.max_guidance_weight)
 
-    def towards(self, plans: Sequence[Any], delays: Sequence[int], shape: tuple[int, int], convert: Any) -> Change:
-        """Return the change of velocities that leads chunks to the leftovers of their sessions.
+    def change(velocity: Any, actions: Any, time: float) -> Any:
+        end, done = actions - time * velocity, 1 - time
+        strength = most if done == 0 else min(most, time / done * (time**2 + done**2) / time**2)
+        return velocity - strength * weights * (target - end)
 
-        Args:
-            plans: The leftover of each of the B rows in the policy's units, (H', D'), or None.
-            delays: For each row, the number of actions that will have been executed.
-            shape: Rows and numbers of a chunk, (H, D).
-            convert: Makes a tensor of an array, on the policy's device.
-        """
-        torch = require("torch")
-        settings = self._processor.rtc_config
-        target, weights = torch.zeros(len(plans), *shape), torch.zeros(len(plans), shape[0], 1)
-        for i, (plan, delay) in enumerate(zip(plans, delays, strict=True)):
-            if plan is not None:
-                part = plan[: shape[0]]
-                target[i, : len(part), : part.shape[1]] = part
-                horizon = min(settings.execution_horizon, len(part))
-                weights[i, :, 0] = self._processor.get_prefix_weights(max(delay, 0), horizon, shape[0])
-        target, weights = convert(target.numpy()), convert(weights.numpy())
-        most = float(settings.max_guidance_weight)
-
-        def change(velocity: Any, actions: Any, time: float) -> Any:
-            end, done = actions - time * velocity, 1 - time
-            strength = most if done == 0 else min(most, time / done * (time**2 + done**2) / time**2)
-            return velocity - strength * weights * (target - end)
-
-        return change
+    return change
 
 
 class SmolVLAPasses(FlowPasses):

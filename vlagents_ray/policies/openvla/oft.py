@@ -77,7 +77,6 @@ class OpenVLAOFT(prismatic.PrismaticPolicy):
 
     @property
     def state_dim(self) -> int | None:
-        """The length of the state vector, as read by the projector; None before loading, or without a projector."""
         return None if self.model is None or self.model.proprio is None else self.model.proprio.dim
 
     def load(self) -> Parallel:
