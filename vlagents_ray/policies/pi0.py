@@ -218,8 +218,7 @@ def _cameras(chosen: Mapping[str, str] | None) -> dict[str, str]:
     """Sort the cameras by the model's image tokens; a checkpoint may be trained without some of them."""
     asked = USUAL_CAMERAS if chosen is None else chosen
     known = [name for name in CAMERAS if name in asked] if asked and set(asked) <= set(CAMERAS) else CAMERAS
-    mapping = choose_cameras(chosen, USUAL_CAMERAS, known)
-    return {name: mapping[name] for name in known}
+    return choose_cameras(chosen, USUAL_CAMERAS, known)
 
 
 def _processor(path: Path) -> Any:

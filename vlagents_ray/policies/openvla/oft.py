@@ -64,8 +64,7 @@ class OpenVLAOFT(prismatic.PrismaticPolicy):
         super().__init__(config)
         chosen = config.cameras or _USUAL
         known = [name for name in _CAMERAS if name in chosen or name == _PRIMARY]
-        mapping = choose_cameras(config.cameras, _USUAL, known)
-        self._cameras = {name: mapping[name] for name in known}
+        self._cameras = choose_cameras(config.cameras, _USUAL, known)
         self._state = list(_STATE if config.state is None else config.state)
 
     @property

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any, ClassVar
 
 import numpy as np
@@ -99,7 +98,12 @@ class Reference(ModelPolicy):
     def load(self) -> LoadedReference:
         folder = find_checkpoint(self.config.checkpoint, self.config.checkpoint_step, needs=[CONFIG, WEIGHTS])
         checkpoint = read_checkpoint(folder)
-        robot = _embodiment(checkpoint, self.config.embodiment, folder)
+        known, name = checkpoint.embodiments, self.config.embodiment
+        if name is None and len(known) == 1:
+            [name] = known
+        if name is None or name not in known:
+            raise ConfigError(f"embodiment: got {name!r}, want one of {sorted(known)}, those of {folder}")
+        robot = known[name]
         device = torch_device(self.config.device)
         from vlagents_ray.policies.reference.network import read_network  # imports torch
 
@@ -108,8 +112,7 @@ class Reference(ModelPolicy):
         network = network.eval().requires_grad_(False).to(device, dtype)
         passes = ReferencePasses(network, self.compilation)
         passes.adapters = self.adapters
-        chosen = model_inputs.choose_cameras(self.config.cameras, robot.cameras, CAMERAS)
-        cameras = {name: chosen[name] for name in CAMERAS}
+        cameras = model_inputs.choose_cameras(self.config.cameras, robot.cameras, CAMERAS)
         return LoadedReference(network, checkpoint, robot, cameras, dtype, passes, Staging(device))
 
     def _begin(self, instruction: str, seed: int, adapter: str = "") -> None:
@@ -154,12 +157,3 @@ class Reference(ModelPolicy):
         inputs = model.staging.stack([row.frames[-1] for row in rows])
         images, state = pixels(inputs["images"]).to(model.dtype), inputs["state"].to(model.dtype)
         return {"tokens": inputs["tokens"], "images": images, "state": state}
-
-
-def _embodiment(checkpoint: Checkpoint, name: str | None, folder: Path) -> Embodiment:
-    known = checkpoint.embodiments
-    if name is None and len(known) == 1:
-        return next(iter(known.values()))
-    if name not in known:
-        raise ConfigError(f"embodiment: got {name!r}, want one of {sorted(known)}, those of {folder}")
-    return known[name]
