@@ -37,11 +37,6 @@ class OctoConfig(ModelConfig):
     )
     dtype: Literal["auto", "float32"] = Field(default="auto", description="float32, as Octo computes")
     compile: Literal[True] = Field(default=True, description="JAX always compiles, once for each of `batch_sizes`")
-    batch_sizes: list[int] | None = Field(
-        default=None,
-        description="the only numbers of rows to run, ascending; each is compiled when the model is loaded; unset: "
-        "those of the deployment's `batch`",
-    )
     source_dir: str | None = Field(
         default=None, description="a checkout of Octo; unset: the installed one, or the one that OCTO_SRC names"
     )

@@ -239,11 +239,6 @@ class OpenPiConfig(ModelConfig):
     max_decoding_steps: int = Field(default=256, ge=1, description="largest number of tokens of a chunk (pi0-FAST)")
     guidance: Guidance = 5.0
     noise_level: NoiseLevel = 0.0
-    batch_sizes: list[int] | None = Field(
-        default=None,
-        description="the only numbers of rows to run; unset: for JAX, or compiled, those of the "
-        "deployment's `batch`, else any",
-    )
 
 
 logger = logging.getLogger(__name__)
