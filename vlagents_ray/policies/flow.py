@@ -193,7 +193,10 @@ class Guide:
                 delay = min(max(row.delay, 0), len(left))
                 plan[i, : len(left), : left.shape[1]] = left
                 frozen[i, :delay] = 1.0
-                weight[i, delay:, 0] = _weights(delay, len(left), horizon)[delay:]
+                # the paper's soft mask, from about 1 after the frozen rows down to 0 where the plan ends
+                behind = np.arange(delay, horizon, dtype=np.float32)
+                share = np.clip((len(left) - behind) / (len(left) - delay + 1), 0.0, 1.0)
+                weight[i, delay:, 0] = share * np.expm1(share) / np.expm1(1.0)
         return cls(plan, frozen, weight)
 
     def to(self, convert: Callable[[np.ndarray], Any]) -> Guide:
@@ -237,13 +240,6 @@ class Guide:
         gain = lower(spread / (time * (1.0 - time) + 1e-6), min(limit, float(steps)))
         pulled = velocity - gain * self.weight * (self.plan - (actions - time * velocity))
         return self.frozen * (noise - self.plan) + (1.0 - self.frozen) * pulled
-
-
-def _weights(delay: int, length: int, horizon: int) -> np.ndarray:
-    """Return (horizon,): the paper's soft mask, from about 1 after the frozen rows down to 0 where the plan ends."""
-    behind = np.arange(horizon, dtype=np.float32)
-    share = np.clip((length - behind) / (length - delay + 1), 0.0, 1.0)
-    return np.asarray(share * np.expm1(share) / np.expm1(1.0), np.float32)
 
 
 class FlowPasses(abc.ABC):
@@ -408,7 +404,6 @@ class Pi0Passes(FlowPasses):
         return torch.stack([torch.stack(layer, 1) for layer in layers_of(cache)], 1), seen.long()
 
     def velocity(self, encoded: Any, seen: Any, state: Any, actions: Any, times: Any) -> Any:
-        """Return the velocity (B, H, D)."""
         cache = cache_of(encoded.unbind(1))  # of this step alone
         stated = {"state": state} if self._stated else {}
         return self.model.denoise_step(

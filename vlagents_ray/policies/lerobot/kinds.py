@@ -184,28 +184,21 @@ class Flow(Kind):
 
     def __init__(self, policy: Any, compilation: Compilation) -> None:
         super().__init__(policy, compilation)
-        model = policy.model
+        model, config = policy.model, self.config
         if policy.name == "smolvla":
             self.passes: FlowPasses = SmolVLAPasses(model, compilation)
         else:
             self.passes = Pi0Passes(model, compilation, stated=policy.name == "pi0")
-        memories = [name for name in _MEMORIES if getattr(policy.config, name, False)]
-        if memories:
+        self.flow_steps = int(config.num_steps if policy.name == "smolvla" else config.num_inference_steps)
+        if memories := [name for name in _MEMORIES if getattr(config, name, False)]:
             raise ConfigError(
                 f"checkpoint: has {memories}, want none: the policy object keeps them, so that sessions would mix"
             )
-
         # The policy calls it after preparing the inputs and before converting the actions.
         model.sample_actions = self.passes.sample
         trained = getattr(policy.rtc_processor.rtc_config, "mode", "guided") == "trained"
-        self.longest = int(getattr(policy.config, LONGEST_PREFIX)) if trained else 0  # rows of a prefix
+        self.longest = int(getattr(config, LONGEST_PREFIX)) if trained else 0  # rows of a prefix
         self.passes.by_row = trained
-
-    @property
-    def flow_steps(self) -> int:
-        """The number of steps from noise to actions."""
-        config = self.config
-        return int(config.num_steps if config.type == "smolvla" else config.num_inference_steps)
 
     def observations(self, rows: Sequence[Row]) -> list[int]:
         return self._shared(rows)[0]
