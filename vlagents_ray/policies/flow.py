@@ -282,10 +282,10 @@ class FlowPasses(abc.ABC):
         inputs: Sequence[Any],
         owners: Sequence[int],
         *,
-        shape: tuple[int, int],
+        noise: np.ndarray,
         steps: int,
         config: Any,
-        dim: int,
+        dim: int | None,
         convert: Callable[[np.ndarray], Any],
     ) -> tuple[np.ndarray, dict[int, dict[str, Any]]]:
         """Return actions (B, H, D) in the model's units, and the outputs requested of rows, by their places.
@@ -294,21 +294,20 @@ class FlowPasses(abc.ABC):
             rows: Those of the batch, with plans in the model's units.
             inputs: The first five arguments of `sample`.
             owners: The observation of each row.
-            shape: The rows and numbers of a chunk, (H, D).
+            noise: Drawn for each row, (B, H, D), before that of the steps, which only some rows draw.
             steps: The number of steps.
             config: The policy's `noise_level`, `guidance` and `execute`.
-            dim: How many of the numbers are the robot's.
+            dim: How many of the numbers are the robot's; None: all.
             convert: Makes a tensor of an array, on the model's device.
         """
-        noise = convert(np.stack([row.noise(*shape) for row in rows]))  # before that of the steps, which some rows draw
-        guide, random = Guide.of(rows, *shape), RandomSteps.of(rows, (steps, *shape), config.noise_level, convert)
-        changes: list[Change] = []
-        if guide is not None:
-            changes.append(guide.to(convert).change(noise, steps=steps, limit=config.guidance))
+        start, changes, (_, horizon, width) = convert(noise), list[Change](), noise.shape
+        if (guide := Guide.of(rows, horizon, width)) is not None:
+            changes.append(guide.to(convert).change(start, steps=steps, limit=config.guidance))
+        random = RandomSteps.of(rows, (steps, horizon, width), config.noise_level, convert)
         if random is not None:
             changes.append(random.change)
-        fingerprints = [row.adapter for row in rows]
-        flow = self.sample(*inputs, noise=noise, owners=owners, steps=steps, changes=changes, fingerprints=fingerprints)
+        adapters = [row.adapter for row in rows] if any(row.adapter for row in rows) else ()
+        flow = self.sample(*inputs, noise=start, owners=owners, steps=steps, changes=changes, fingerprints=adapters)
         return fetch(flow), {} if random is None else random.stated(config.execute, dim)
 
     def sample(

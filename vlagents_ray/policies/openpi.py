@@ -18,13 +18,13 @@ from vlagents_ray.contract import ActionSpec, Contract, StateSpec
 from vlagents_ray.errors import ConfigError, InvalidObservation
 from vlagents_ray.interface import Obs
 from vlagents_ray.policies.base import ModelConfig, ModelPolicy, Prediction, Row
-from vlagents_ray.policies.base.accelerator import fetch, jax_device, torch_device
+from vlagents_ray.policies.base.accelerator import jax_device, torch_device
 from vlagents_ray.policies.base.checkpoint import STEP, SavedTensors, find_checkpoint, require_loaded
 from vlagents_ray.policies.base.config import Guidance, NoiseLevel
 from vlagents_ray.policies.base.model_code import use_source
 from vlagents_ray.policies.base.model_inputs import CLOSED, GRIPPER, camera_images, choose_cameras, state_vector
 from vlagents_ray.policies.compilation import Compilation
-from vlagents_ray.policies.flow import OFFERED, Change, Guide, Pi0Passes, RandomSteps
+from vlagents_ray.policies.flow import OFFERED, Guide, Pi0Passes
 from vlagents_ray.policies.outcomes import attempt
 from vlagents_ray.registry import require
 
@@ -253,10 +253,10 @@ class SampleBatch:
     """The inputs of a model for B chunks."""
 
     inputs: dict[str, Any]  # of P observations
+    rows: Sequence[Row]  # with plans in the model's units
     noise: np.ndarray  # one array for each row
-    guide: Guide | None  # of the rows, if any of them follows a plan
     owners: Sequence[int]  # the observation of each row, as of `ModelPolicy.observations_of`
-    random: RandomSteps | None  # the result of `random_steps` for the rows
+    dim: int | None  # how many numbers of an action are the robot's
 
 
 class OpenPiModel(abc.ABC):
@@ -267,12 +267,8 @@ class OpenPiModel(abc.ABC):
     trained: Any  # what a learner trains: the torch module, or the dicts of arrays that JAX checkpoints have
 
     @abc.abstractmethod
-    def sample(self, batch: SampleBatch) -> np.ndarray:
-        """Compute actions (B, H, action_dim), or tokens (B, T)."""
-
-    def random_steps(self, rows: Sequence[Row], noise_level: float) -> RandomSteps | None:
-        """Return the random steps of rows for which outputs are requested; None if there are none."""
-        return None
+    def sample(self, batch: SampleBatch) -> tuple[np.ndarray, dict[int, dict[str, Any]]]:
+        """Compute actions (B, H, action_dim), or tokens (B, T), and the outputs requested of rows, by their places."""
 
 
 class JaxFlow(OpenPiModel):
@@ -331,9 +327,9 @@ class JaxFlow(OpenPiModel):
         self._encode, self._gather, self._follow = jax.jit(encode), jax.jit(gather), jax.jit(follow)
         self.noise_shape = (network.action_horizon, network.action_dim)
 
-    def sample(self, batch: SampleBatch) -> np.ndarray:
+    def sample(self, batch: SampleBatch) -> tuple[np.ndarray, dict[int, dict[str, Any]]]:
         """Compute actions (B, H, action_dim) float32; a batch without plans runs the same program without guidance."""
-        jax, guide = require("jax"), batch.guide
+        jax, guide = require("jax"), Guide.of(batch.rows, *batch.noise.shape[1:])
         if guide is None:
             none = np.zeros((*batch.noise.shape[:2], 1), np.float32)
             guide = Guide(np.zeros_like(batch.noise), none, none)
@@ -342,7 +338,7 @@ class JaxFlow(OpenPiModel):
         encoded = self._encode(self.trained, inputs)
         if len(encoded[0]) < len(owners):
             encoded = self._gather(encoded, owners)
-        return np.asarray(self._follow(self.trained, encoded, noise, plan), np.float32)  # waits for the device
+        return np.asarray(self._follow(self.trained, encoded, noise, plan), np.float32), {}  # waits for the device
 
 
 class JaxTokens(OpenPiModel):
@@ -357,9 +353,9 @@ class JaxTokens(OpenPiModel):
 
         self._sample = jax.jit(sample)
 
-    def sample(self, batch: SampleBatch) -> np.ndarray:
-        jax = require("jax")
-        return self.ended(np.asarray(self._sample(self.trained, jax.device_put(batch.inputs, self._device)), np.int32))
+    def sample(self, batch: SampleBatch) -> tuple[np.ndarray, dict[int, dict[str, Any]]]:
+        tokens = self._sample(self.trained, require("jax").device_put(batch.inputs, self._device))
+        return self.ended(np.asarray(tokens, np.int32)), {}
 
     @staticmethod
     def ended(tokens: np.ndarray) -> np.ndarray:
@@ -376,24 +372,21 @@ class TorchFlow(OpenPiModel):
     def __init__(self, network: Any, device: Any, config: OpenPiConfig, compilation: Compilation) -> None:
         self.trained, self._device = network, device
         self._passes = Pi0Passes(network, compilation)
-        self._steps, self._limit = config.steps or _STEPS, config.guidance
-        self.noise_shape: tuple[int, int] = (network.config.action_horizon, network.config.action_dim)
+        self._config, self.noise_shape = config, (network.config.action_horizon, network.config.action_dim)
 
-    def sample(self, batch: SampleBatch) -> np.ndarray:
-        jax, torch = require("jax"), require("torch")
-        observation = _observation(jax.tree.map(self._convert, batch.inputs))
-        start, changes = self._convert(batch.noise), list[Change]()
-        if batch.guide is not None:
-            changes.append(batch.guide.to(self._convert).change(start, steps=self._steps, limit=self._limit))
-        if batch.random is not None:
-            changes.append(batch.random.change)
-        with torch.inference_mode():
-            inputs = self.trained._preprocess_observation(observation, train=False)
-            flow = self._passes.sample(*inputs, noise=start, owners=batch.owners, steps=self._steps, changes=changes)
-        return fetch(flow.float())
-
-    def random_steps(self, rows: Sequence[Row], noise_level: float) -> RandomSteps | None:
-        return RandomSteps.of(rows, (self._steps, *self.noise_shape), noise_level, self._convert)
+    def sample(self, batch: SampleBatch) -> tuple[np.ndarray, dict[int, dict[str, Any]]]:
+        observation = _observation(require("jax").tree.map(self._convert, batch.inputs))
+        with require("torch").inference_mode():
+            return self._passes.chunks(
+                batch.rows,
+                self.trained._preprocess_observation(observation, train=False),
+                batch.owners,
+                noise=batch.noise,
+                steps=self._config.steps or _STEPS,
+                config=self._config,
+                dim=batch.dim,
+                convert=self._convert,
+            )
 
     def _convert(self, array: np.ndarray) -> Any:
         """Return a copy of the array as a tensor on the device."""
@@ -559,14 +552,17 @@ class OpenPi(ModelPolicy):
             return read  # errors all
         # A valid row replaces an invalid one, so that the number of rows stays one that is compiled.
         spare = replace(spare[0], want=()), spare[1]
-        rows, noise = zip(*(spare if isinstance(one, Exception) else one for one in read), strict=True)
-        flows, stated = self._sample(rows, np.stack(noise))
-        actions = self.loaded().transforms.actions
+        ready, noise = zip(*(spare if isinstance(one, Exception) else one for one in read), strict=True)
+        loaded, each = self.loaded(), list(range(len(ready)))
+        firsts, owners = self.observations_of(ready) if loaded.model.shares else (each, each)
+        inputs = [row.frames[-1].inputs for row in ready]
+        batch = require("jax").tree.map(lambda *leaves: np.stack(leaves), *(inputs[i] for i in firsts))
+        flows, stated = loaded.model.sample(SampleBatch(batch, ready, np.stack(noise), owners, loaded.robot.action.dim))
         return [
             one
             if isinstance(one, Exception)
-            else Prediction(actions(row.frames[-1].inputs["state"], flow), behaviour=stated.get(i, {}))
-            for i, (one, row, flow) in enumerate(zip(read, rows, flows, strict=True))
+            else Prediction(loaded.transforms.actions(own["state"], flow), behaviour=stated.get(i, {}))
+            for i, (one, own, flow) in enumerate(zip(read, inputs, flows, strict=True))
         ]
 
     def _planned(self, row: Row) -> tuple[Row, np.ndarray]:
@@ -576,18 +572,6 @@ class OpenPi(ModelPolicy):
             plan = loaded.transforms.plan(row.frames[-1].raw, row.instruction, row.leftover)
             row = replace(row, leftover=plan)
         return row, row.noise(*loaded.model.noise_shape or ())
-
-    def _sample(self, rows: Sequence[Row], noise: np.ndarray) -> tuple[np.ndarray, dict[int, dict[str, Any]]]:
-        """Return the model's output for rows, and the requested extra outputs by the index of the row."""
-        model, shape = self.loaded().model, self.loaded().model.noise_shape
-        each = list(range(len(rows)))
-        firsts, owners = self.observations_of(rows) if model.shares else (each, each)
-        inputs = (rows[i].frames[-1].inputs for i in firsts)
-        batch = require("jax").tree.map(lambda *leaves: np.stack(leaves), *inputs)
-        guide = None if shape is None else Guide.of(rows, *shape)
-        random = model.random_steps(rows, self.config.noise_level)
-        flows = model.sample(SampleBatch(batch, noise, guide, owners, random))
-        return flows, {} if random is None else random.stated(self.config.execute, self.loaded().robot.action.dim)
 
     def _folder(self) -> Path:
         name, step = self.config.checkpoint, self.config.checkpoint_step

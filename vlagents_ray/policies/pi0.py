@@ -191,7 +191,7 @@ class Pi0(ModelPolicy):
                 [model.planned(row) for row in rows],
                 [[inputs["pixel_values"]], cameras, *others],
                 owners,
-                shape=(settings.chunk_size, settings.max_action_dim),
+                noise=np.stack([row.noise(settings.chunk_size, settings.max_action_dim) for row in rows]),
                 steps=self.config.steps or settings.num_inference_steps,
                 config=self.config,
                 dim=len(model.processor.actions_mean),

@@ -143,7 +143,7 @@ class Reference(ModelPolicy):
                 rows,
                 [inputs["images"].unbind(1), cameras, tokens, tokens != 0, inputs["state"]],
                 owners,
-                shape=(sizes.horizon, sizes.action),
+                noise=np.stack([row.noise(sizes.horizon, sizes.action) for row in rows]),
                 steps=self.config.steps,
                 config=self.config,
                 dim=sizes.action,
