@@ -203,10 +203,6 @@ class Guide:
         """Convert the arrays to another library, or move them to another device."""
         return Guide(convert(self.plan), convert(self.frozen), convert(self.weight))
 
-    def change(self, noise: Any, *, steps: int, limit: float) -> Callable[[Any, Any, float], Any]:
-        """Return `steer` for a flow from some noise (B, H, D), as a function of velocity, noisy actions and time."""
-        return lambda velocity, actions, time: self.steer(velocity, actions, noise, time, steps=steps, limit=limit)
-
     def given(self, noise: Any) -> Any:
         """Return noise (B, H, D) with the frozen rows of the plan in it, for a policy that was trained with prefixes.
 
@@ -223,14 +219,14 @@ class Guide:
         self,
         velocity: Any,
         actions: Any,
-        noise: Any,
         time: Any,
         *,
+        noise: Any,
         steps: int,
         limit: float,
         lower: Callable[[Any, float], Any] = min,
     ) -> Any:
-        """Return the velocity (B, H, D), corrected by the plan, at the noisy actions of this flow time.
+        """Return the velocity (B, H, D), corrected by the plan, at the noisy actions of a time of a flow from `noise`.
 
         The gain of the correction of a later row is at most `limit`, and at most the number of steps: with that, one
         step goes to the end. `lower` returns the smaller of two numbers, for libraries whose `time` is not a plain
@@ -302,7 +298,7 @@ class FlowPasses(abc.ABC):
         """
         start, changes, (_, horizon, width) = convert(noise), list[Change](), noise.shape
         if (guide := Guide.of(rows, horizon, width)) is not None:
-            changes.append(guide.to(convert).change(start, steps=steps, limit=config.guidance))
+            changes.append(partial(guide.to(convert).steer, noise=start, steps=steps, limit=config.guidance))
         random = RandomSteps.of(rows, (steps, horizon, width), config.noise_level, convert)
         if random is not None:
             changes.append(random.change)

@@ -315,7 +315,9 @@ class JaxFlow(OpenPiModel):
                     adarms_cond=[None, condition],
                 )
                 velocity = model.action_out_proj(hidden[:, -noise.shape[1] :])
-                velocity = guide.steer(velocity, actions, noise, time, steps=steps, limit=limit, lower=jnp.minimum)
+                velocity = guide.steer(
+                    velocity, actions, time, noise=noise, steps=steps, limit=limit, lower=jnp.minimum
+                )
                 return actions - velocity / steps, time - 1 / steps
 
             return jax.lax.while_loop(lambda now: now[1] >= 0.5 / steps, step, (noise, 1.0))[0]
