@@ -387,8 +387,6 @@ class Pi0Passes(FlowPasses):
 
     def encode(self, tokens: Any, mask: Any, cameras: Any, state: Any, *images: Any) -> tuple[Any, Any]:
         """Return keys and values, and which tokens are there; the state is not read."""
-        import torch  # the compiler follows a statement, and not `require`
-
         embedded, seen, causal = self.model.embed_prefix(list(images), list(cameras.unbind(1)), tokens, mask)
         _, cache = self.model.paligemma_with_expert.forward(
             attention_mask=self._mask_4d(self.module.make_att_2d_masks(seen, causal)),
@@ -396,7 +394,7 @@ class Pi0Passes(FlowPasses):
             inputs_embeds=[embedded, None],
             use_cache=True,
         )
-        return torch.stack([torch.stack(layer, 1) for layer in layers_of(cache)], 1), seen.long()
+        return stack_of(layers_of(cache)), seen.long()
 
     def velocity(self, encoded: Any, seen: Any, state: Any, actions: Any, times: Any) -> Any:
         cache = cache_of(encoded.unbind(1))  # of this step alone
@@ -411,6 +409,13 @@ def layers_of(cache: Any) -> list[tuple[Any, Any]]:
     if hasattr(cache, "layers"):
         return [(layer.keys, layer.values) for layer in cache.layers]
     return [cache[number] for number in range(len(cache))]
+
+
+def stack_of(layers: Sequence[tuple[Any, Any]]) -> Any:
+    """Return the keys and values (B, heads, L, E) of each layer in one tensor (B, layers, 2, heads, L, E)."""
+    import torch  # the compiler follows a statement, and not `require`
+
+    return torch.stack([torch.stack(layer, 1) for layer in layers], 1)
 
 
 def cache_of(layers: Sequence[Any]) -> Any:

@@ -25,7 +25,7 @@ from vlagents_ray.policies.base.config import Guidance, NoiseLevel
 from vlagents_ray.policies.base.model_inputs import camera_images, choose_cameras, resize_with_pad, state_vector
 from vlagents_ray.policies.base.staging import StagedRow, Staging
 from vlagents_ray.policies.compilation import Compilation
-from vlagents_ray.policies.flow import OFFERED, FlowPasses, cache_of, layers_of
+from vlagents_ray.policies.flow import OFFERED, FlowPasses, cache_of, layers_of, stack_of
 from vlagents_ray.registry import require
 
 CAMERAS = ("base_0_rgb", "left_wrist_0_rgb", "right_wrist_0_rgb")  # openpi's names, in the order of the image tokens
@@ -259,16 +259,14 @@ class Pi0HfPasses(FlowPasses):
 
     def encode(self, tokens: Any, mask: Any, cameras: Any, state: Any, *images: Any) -> tuple[Any, Any]:
         """Return keys and values (P, layers, 2, heads, L, E), and the mask; `images` is one (P, cameras, 3, S, S)."""
-        import torch  # the compiler follows an import statement, but not `require`
-
         cache = self.model.model.vlm(
             inputs_embeds=self.model.model.embed_prefix(tokens, images[0], cameras),
             attention_mask=mask,
             position_ids=mask.cumsum(-1) - 1,
-            token_type_ids=torch.zeros_like(mask),
+            token_type_ids=mask.new_zeros(mask.shape),
             use_cache=True,
         ).past_key_values
-        return torch.stack([torch.stack(layer, 1) for layer in layers_of(cache)], 1), mask
+        return stack_of(layers_of(cache)), mask
 
     def velocity(self, encoded: Any, seen: Any, state: Any, actions: Any, times: Any) -> Any:
         cache = cache_of(encoded.unbind(1))  # of this step alone: later ones must not attend to it

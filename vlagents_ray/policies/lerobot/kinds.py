@@ -22,7 +22,7 @@ from vlagents_ray.policies.base.accelerator import fetch
 from vlagents_ray.policies.base.model_inputs import GRIPPER
 from vlagents_ray.policies.base.staging import Staging
 from vlagents_ray.policies.compilation import Compilation
-from vlagents_ray.policies.flow import Change, FlowPasses, Guide, Pi0Passes, RandomSteps, cache_of, layers_of
+from vlagents_ray.policies.flow import Change, FlowPasses, Guide, Pi0Passes, RandomSteps, cache_of, layers_of, stack_of
 from vlagents_ray.registry import require
 
 LONGEST_PREFIX = "rtc_training_max_delay"  # the config's field, of LeRobot after 0.6.1, for π0.5; 0: without prefixes
@@ -305,8 +305,6 @@ class SmolVLAPasses(FlowPasses):
         return found
 
     def encode(self, tokens: Any, mask: Any, cameras: Any, state: Any, *patches: Any) -> tuple[Any, Any]:
-        import torch  # the compiler follows an import statement, but not `require`
-
         embedded, seen, causal = self.model.embed_prefix(patches, cameras.unbind(1), tokens, mask, state=state)
         _, cache = self.model.vlm_with_expert.forward(
             attention_mask=self.module.make_att_2d_masks(seen, causal),
@@ -319,7 +317,7 @@ class SmolVLAPasses(FlowPasses):
             layers = [(layer["key_states"], layer["value_states"]) for layer in cache.values()]
         else:
             layers = layers_of(cache)
-        return torch.stack([torch.stack(layer, 1) for layer in layers], 1), seen.long()
+        return stack_of(layers), seen.long()
 
     def velocity(self, encoded: Any, seen: Any, state: Any, actions: Any, times: Any) -> Any:
         layers = encoded.unbind(1)
