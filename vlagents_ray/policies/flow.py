@@ -302,7 +302,7 @@ class FlowPasses(abc.ABC):
         random = RandomSteps.of(rows, (steps, horizon, width), config.noise_level, convert)
         if random is not None:
             changes.append(random.change)
-        adapters = [row.adapter for row in rows] if any(row.adapter for row in rows) else ()
+        adapters: Sequence[str] = [row.adapter for row in rows] if any(row.adapter for row in rows) else ()
         flow = self.sample(*inputs, noise=start, owners=owners, steps=steps, changes=changes, fingerprints=adapters)
         return fetch(flow), {} if random is None else random.stated(config.execute, dim)
 
