@@ -8,10 +8,8 @@ adapter use one of zeros. S-LoRA (arXiv 2311.03285) and Punica (arXiv 2310.18547
 
 from __future__ import annotations
 
-import hashlib
 import json
 import math
-import struct
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from contextvars import ContextVar
@@ -22,7 +20,7 @@ from typing import Any
 
 from vlagents_ray.errors import ConfigError, MalformedMessage, PolicyFailed, UnknownCheckpoint, UnknownSession
 from vlagents_ray.interface import POLICY
-from vlagents_ray.weights.safetensors import PART_BYTES, ValuesReader, read_header
+from vlagents_ray.weights.safetensors import read_values
 from vlagents_ray.weights.trainable import converted
 
 ADAPTER = "adapter"  # option of a reset: the name of the session's adapter
@@ -37,12 +35,6 @@ class Adapter:
     weights: str = ""  # digest of the base's files and the adapter's
     fingerprint: str = ""  # the beginning of that digest; empty: the session acts with the base alone
     revision: str | None = None  # the hub's commit of the adapter
-
-    @classmethod
-    def of(cls, source: str, base: str, own: str, revision: str | None = None) -> Adapter:
-        """Make an adapter from its source and commit, and from the digests of the base and of its own files."""
-        digest = hashlib.sha256(f"{base} {own}".encode()).hexdigest()
-        return cls(source, f"{own.partition(':')[0]}:{digest}", digest[:DIGITS], revision)
 
     @property
     def identity(self) -> dict[str, Any]:
@@ -257,7 +249,11 @@ def read_adapter(folder: Path, network: Any) -> dict[str, tuple[Any, Any, float]
             network.
     """
     config = _config(folder)
-    saved = _tensors(folder / WEIGHTS)
+    try:
+        with (folder / WEIGHTS).open("rb") as file:
+            saved = read_values(file)
+    except (OSError, MalformedMessage, MemoryError) as error:
+        raise ConfigError(f"{folder / WEIGHTS}: is damaged, or of another format ({error}); copy it again") from error
     _require_complete(folder, saved, network)
     modules = dict(network.named_modules())
     names = [key.removeprefix(_PREFIX).removesuffix(_DOWN) for key in saved if key.endswith(_DOWN)]
@@ -285,20 +281,6 @@ def _config(folder: Path) -> dict[str, Any]:
             f"into its base (merge_and_unload) and serve that as a checkpoint of its own"
         )
     return config
-
-
-def _tensors(file: Path) -> Mapping[str, Any]:
-    try:
-        with file.open("rb") as opened:
-            length = opened.read(8)
-            reader = ValuesReader(read_header(length + opened.read(struct.unpack("<Q", length)[0])))
-            while part := opened.read(PART_BYTES):
-                reader.add(part)
-        if reader.received != reader.size:
-            raise MalformedMessage(f"safetensors: got {reader.received} bytes of values, want {reader.size}")
-        return reader.values()
-    except (OSError, MalformedMessage, struct.error, OverflowError, MemoryError) as error:
-        raise ConfigError(f"{file}: is damaged, or of another format ({error}); copy it again") from error
 
 
 def _require_complete(folder: Path, saved: Mapping[str, Any], network: Any) -> None:

@@ -21,7 +21,7 @@ from operator import attrgetter
 from pathlib import Path
 from typing import Any, ClassVar, Literal
 
-from vlagents_ray.errors import ConfigError, NotTrainable
+from vlagents_ray.errors import ConfigError
 from vlagents_ray.policies.loading import report_uncompiled
 from vlagents_ray.registry import require
 
@@ -63,8 +63,6 @@ def _folder(library: str) -> Path | None:
 
 Quantization = Literal["int8", "float8"]
 
-_CONFIGS: dict[Quantization, str] = {"int8": "Int8WeightOnlyConfig", "float8": "Float8WeightOnlyConfig"}
-
 
 def quantize(policy: Any, kind: Quantization) -> None:
     """Replace the weights of all linear layers of a loaded policy's network, in place.
@@ -82,18 +80,13 @@ def quantize(policy: Any, kind: Quantization) -> None:
         raise ConfigError(f"quantization: {type(policy).__name__} does not offer it; leave it out")
     torchao = require("torchao.quantization")
     try:
-        torchao.quantize_(attrgetter(policy.network)(policy), getattr(torchao, _CONFIGS[kind])())
+        config = getattr(torchao, f"{kind.capitalize()}WeightOnlyConfig")()
+        torchao.quantize_(attrgetter(policy.network)(policy), config)
     except (RuntimeError, AttributeError, NotImplementedError, AssertionError) as error:
         raise ConfigError(
             f"quantization {kind!r}: torchao cannot use it here ({type(error).__name__}: {error}); try the other one, "
             f"or dtype: bfloat16"
         ) from error
-
-
-def require_whole(kind: Quantization | None) -> None:
-    """Raise `NotTrainable` if weights are quantized, since a learner's weights are not."""
-    if kind is not None:
-        raise NotTrainable(f"quantization {kind!r}: weights of 8 bits cannot be replaced by a learner's; leave it out")
 
 
 _WARM_UP = 3  # calls before the capture, in which libraries allocate their own memory

@@ -193,16 +193,15 @@ class Guide:
                 delay = min(max(row.delay, 0), len(left))
                 plan[i, : len(left), : left.shape[1]] = left
                 frozen[i, :delay] = 1.0
-                weight[i, delay:, 0] = _weights(delay, len(left), horizon)[delay:]
+                # the paper's soft mask, from about 1 after the frozen rows down to 0 where the plan ends
+                behind = np.arange(delay, horizon, dtype=np.float32)
+                share = np.clip((len(left) - behind) / (len(left) - delay + 1), 0.0, 1.0)
+                weight[i, delay:, 0] = share * np.expm1(share) / np.expm1(1.0)
         return cls(plan, frozen, weight)
 
     def to(self, convert: Callable[[np.ndarray], Any]) -> Guide:
         """Convert the arrays to another library, or move them to another device."""
         return Guide(convert(self.plan), convert(self.frozen), convert(self.weight))
-
-    def change(self, noise: Any, *, steps: int, limit: float) -> Callable[[Any, Any, float], Any]:
-        """Return `steer` for a flow from some noise (B, H, D), as a function of velocity, noisy actions and time."""
-        return lambda velocity, actions, time: self.steer(velocity, actions, noise, time, steps=steps, limit=limit)
 
     def given(self, noise: Any) -> Any:
         """Return noise (B, H, D) with the frozen rows of the plan in it, for a policy that was trained with prefixes.
@@ -220,14 +219,14 @@ class Guide:
         self,
         velocity: Any,
         actions: Any,
-        noise: Any,
         time: Any,
         *,
+        noise: Any,
         steps: int,
         limit: float,
         lower: Callable[[Any, float], Any] = min,
     ) -> Any:
-        """Return the velocity (B, H, D), corrected by the plan, at the noisy actions of this flow time.
+        """Return the velocity (B, H, D), corrected by the plan, at the noisy actions of a time of a flow from `noise`.
 
         The gain of the correction of a later row is at most `limit`, and at most the number of steps: with that, one
         step goes to the end. `lower` returns the smaller of two numbers, for libraries whose `time` is not a plain
@@ -237,41 +236,6 @@ class Guide:
         gain = lower(spread / (time * (1.0 - time) + 1e-6), min(limit, float(steps)))
         pulled = velocity - gain * self.weight * (self.plan - (actions - time * velocity))
         return self.frozen * (noise - self.plan) + (1.0 - self.frozen) * pulled
-
-
-def start_flow(
-    rows: Sequence[Row],
-    shape: tuple[int, int],
-    steps: int,
-    *,
-    noise_level: float,
-    limit: float,
-    convert: Callable[[np.ndarray], Any],
-) -> tuple[Any, list[Change], RandomSteps | None]:
-    """Draw the noise of a batch's flow.
-
-    Args:
-        rows: Those of the batch, with plans in the model's units.
-        shape: The rows and numbers of a chunk, (H, D).
-        steps: The number of steps.
-        noise_level: See `step_mean`.
-        limit: See `Guide.steer`.
-        convert: Makes a tensor of an array, on the model's device.
-
-    Returns:
-        The noise (B, H, D), the changes for `follow`, and the random steps, if any row wants them.
-    """
-    noise = convert(np.stack([row.noise(*shape) for row in rows]))  # before that of the steps, which some rows draw
-    guide, random = Guide.of(rows, *shape), RandomSteps.of(rows, (steps, *shape), noise_level, convert)
-    changes = [] if guide is None else [guide.to(convert).change(noise, steps=steps, limit=limit)]
-    return noise, changes if random is None else [*changes, random.change], random
-
-
-def _weights(delay: int, length: int, horizon: int) -> np.ndarray:
-    """Return (horizon,): the paper's soft mask, from about 1 after the frozen rows down to 0 where the plan ends."""
-    behind = np.arange(horizon, dtype=np.float32)
-    share = np.clip((length - behind) / (length - delay + 1), 0.0, 1.0)
-    return np.asarray(share * np.expm1(share) / np.expm1(1.0), np.float32)
 
 
 class FlowPasses(abc.ABC):
@@ -307,6 +271,40 @@ class FlowPasses(abc.ABC):
     @abc.abstractmethod
     def velocity(self, encoded: Any, seen: Any, state: Any, actions: Any, times: Any) -> Any:
         """Return the velocity (B, H, D) of noisy actions (B, H, D) at times (B,), or (B, H) with `by_row`."""
+
+    def chunks(
+        self,
+        rows: Sequence[Row],
+        inputs: Sequence[Any],
+        owners: Sequence[int],
+        *,
+        noise: np.ndarray,
+        steps: int,
+        config: Any,
+        dim: int | None,
+        convert: Callable[[np.ndarray], Any],
+    ) -> tuple[np.ndarray, dict[int, dict[str, Any]]]:
+        """Return actions (B, H, D) in the model's units, and the outputs requested of rows, by their places.
+
+        Args:
+            rows: Those of the batch, with plans in the model's units.
+            inputs: The first five arguments of `sample`.
+            owners: The observation of each row.
+            noise: Drawn for each row, (B, H, D), before that of the steps, which only some rows draw.
+            steps: The number of steps.
+            config: The policy's `noise_level`, `guidance` and `execute`.
+            dim: How many of the numbers are the robot's; None: all.
+            convert: Makes a tensor of an array, on the model's device.
+        """
+        start, changes, (_, horizon, width) = convert(noise), list[Change](), noise.shape
+        if (guide := Guide.of(rows, horizon, width)) is not None:
+            changes.append(partial(guide.to(convert).steer, noise=start, steps=steps, limit=config.guidance))
+        random = RandomSteps.of(rows, (steps, horizon, width), config.noise_level, convert)
+        if random is not None:
+            changes.append(random.change)
+        adapters: Sequence[str] = [row.adapter for row in rows] if any(row.adapter for row in rows) else ()
+        flow = self.sample(*inputs, noise=start, owners=owners, steps=steps, changes=changes, fingerprints=adapters)
+        return fetch(flow), {} if random is None else random.stated(config.execute, dim)
 
     def sample(
         self,
@@ -389,8 +387,6 @@ class Pi0Passes(FlowPasses):
 
     def encode(self, tokens: Any, mask: Any, cameras: Any, state: Any, *images: Any) -> tuple[Any, Any]:
         """Return keys and values, and which tokens are there; the state is not read."""
-        import torch  # the compiler follows a statement, and not `require`
-
         embedded, seen, causal = self.model.embed_prefix(list(images), list(cameras.unbind(1)), tokens, mask)
         _, cache = self.model.paligemma_with_expert.forward(
             attention_mask=self._mask_4d(self.module.make_att_2d_masks(seen, causal)),
@@ -398,10 +394,9 @@ class Pi0Passes(FlowPasses):
             inputs_embeds=[embedded, None],
             use_cache=True,
         )
-        return torch.stack([torch.stack(layer, 1) for layer in layers_of(cache)], 1), seen.long()
+        return stack_of(layers_of(cache)), seen.long()
 
     def velocity(self, encoded: Any, seen: Any, state: Any, actions: Any, times: Any) -> Any:
-        """Return the velocity (B, H, D)."""
         cache = cache_of(encoded.unbind(1))  # of this step alone
         stated = {"state": state} if self._stated else {}
         return self.model.denoise_step(
@@ -414,6 +409,13 @@ def layers_of(cache: Any) -> list[tuple[Any, Any]]:
     if hasattr(cache, "layers"):
         return [(layer.keys, layer.values) for layer in cache.layers]
     return [cache[number] for number in range(len(cache))]
+
+
+def stack_of(layers: Sequence[tuple[Any, Any]]) -> Any:
+    """Return the keys and values (B, heads, L, E) of each layer in one tensor (B, layers, 2, heads, L, E)."""
+    import torch  # the compiler follows a statement, and not `require`
+
+    return torch.stack([torch.stack(layer, 1) for layer in layers], 1)
 
 
 def cache_of(layers: Sequence[Any]) -> Any:

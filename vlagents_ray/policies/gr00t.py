@@ -451,7 +451,6 @@ class Gr00t(ModelPolicy):
 
     @property
     def state_dim(self) -> int | None:
-        """The length of the embodiment's state; None before the checkpoint is loaded."""
         return None if self.model is None else sum(self.model.embodiment.state.values())
 
     @property

@@ -24,7 +24,7 @@ class LoadingReport:
     on_progress: Callable[[str], None]  # called with each step, on the loading thread
     batch_sizes: Sequence[int]  # the server's, ascending
     uncompiled: list[str] = field(default_factory=list)  # parts that run without compilation, although `compile` is set
-    devices: list[dict[str, Any]] = field(default_factory=list)  # of the models, see `accelerator.described`
+    devices: list[dict[str, Any]] = field(default_factory=list)  # of the models, see `accelerator.torch_device`
     most_rows: int | None = None  # of a forward pass, if memory limits it
     pads: bool = False  # whether the policy itself pads batches to its sizes, with fewer rows than a server knows of
     pass_s: dict[int, float] = field(default_factory=dict)  # shortest duration of a forward pass so far, s, by its rows
@@ -36,10 +36,6 @@ class LoadingReport:
     def accelerated(self) -> bool:
         """Whether a model computes on another device than a CPU."""
         return any(device["kind"] != "cpu" for device in self.devices)
-
-    def record_pass(self, rows: int, duration_s: float) -> None:
-        """Record the duration of a forward pass."""
-        self.pass_s[rows] = min(duration_s, self.pass_s.get(rows, duration_s))
 
 
 _report: ContextVar[LoadingReport | None] = ContextVar("_report", default=None)

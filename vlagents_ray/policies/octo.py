@@ -37,11 +37,6 @@ class OctoConfig(ModelConfig):
     )
     dtype: Literal["auto", "float32"] = Field(default="auto", description="float32, as Octo computes")
     compile: Literal[True] = Field(default=True, description="JAX always compiles, once for each of `batch_sizes`")
-    batch_sizes: list[int] | None = Field(
-        default=None,
-        description="the only numbers of rows to run, ascending; each is compiled when the model is loaded; unset: "
-        "those of the deployment's `batch`",
-    )
     source_dir: str | None = Field(
         default=None, description="a checkout of Octo; unset: the installed one, or the one that OCTO_SRC names"
     )
@@ -260,19 +255,13 @@ class OctoNetwork:
                 f"checkpoint {folder}: Octo could not load it ({type(error).__name__}: {error}); is it complete, of "
                 f"this version of Octo, and is its language encoder's tokenizer on the hub or in the cache?"
             ) from error
-        network = cls(model, chosen)
-        require_filled(model.params, network.shapes())
+        network, example, jax = cls(model, chosen), model.example_batch, require("jax")
+        init = partial(model.module.init, train=False)
+        inputs = example["observation"], example["task"], example["observation"]["timestep_pad_mask"]
+        require_filled(model.params, jax.eval_shape(init, jax.random.PRNGKey(0), *inputs)["params"])
         if type(network.head).__name__ not in _HEADS:
             raise ConfigError(f"action head: got {type(network.head).__name__}, want one of {list(_HEADS)}")
         return network
-
-    def shapes(self) -> Any:
-        jax = require("jax")
-        example = self.model.example_batch
-        init = partial(self.model.module.init, train=False)
-        observation, task = example["observation"], example["task"]
-        key = jax.random.PRNGKey(0)
-        return jax.eval_shape(init, key, observation, task, observation["timestep_pad_mask"])["params"]
 
     @cached_property
     def cameras(self) -> dict[str, tuple[int, int]]:

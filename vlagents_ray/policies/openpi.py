@@ -18,13 +18,13 @@ from vlagents_ray.contract import ActionSpec, Contract, StateSpec
 from vlagents_ray.errors import ConfigError, InvalidObservation
 from vlagents_ray.interface import Obs
 from vlagents_ray.policies.base import ModelConfig, ModelPolicy, Prediction, Row
-from vlagents_ray.policies.base.accelerator import fetch, jax_device, torch_device
+from vlagents_ray.policies.base.accelerator import jax_device, torch_device
 from vlagents_ray.policies.base.checkpoint import STEP, SavedTensors, find_checkpoint, require_loaded
 from vlagents_ray.policies.base.config import Guidance, NoiseLevel
 from vlagents_ray.policies.base.model_code import use_source
 from vlagents_ray.policies.base.model_inputs import CLOSED, GRIPPER, camera_images, choose_cameras, state_vector
 from vlagents_ray.policies.compilation import Compilation
-from vlagents_ray.policies.flow import OFFERED, Change, Guide, Pi0Passes, RandomSteps
+from vlagents_ray.policies.flow import OFFERED, Guide, Pi0Passes
 from vlagents_ray.policies.outcomes import attempt
 from vlagents_ray.registry import require
 
@@ -82,17 +82,11 @@ ROBOTS: Mapping[str, RobotConvention] = {  # by the class of openpi's observatio
     "AlohaInputs": _ALOHA,
 }
 _ENDS = ("q01", "q99")  # the statistics by which a robot is compared with the training
-_ALOHA_SIM = {"images.cam_high": "front"}  # the simulation has one camera
 
 
-def choose_robot(
-    config: str,
-    transform: str,
-    cameras: Mapping[str, str] | None,
-    state: Mapping[str, Mapping[str, int]] | None,
-    layout: Layout | None,
-) -> RobotConvention:
+def choose_robot(config: str, transform: str, settings: OpenPiConfig) -> RobotConvention:
     """Return the convention of a config's robot, overridden by the settings; raises `ConfigError` if it is unknown."""
+    cameras, state = settings.cameras, settings.state
     if (usual := ROBOTS.get(transform)) is None:
         if cameras is None or state is None:
             raise ConfigError(
@@ -101,13 +95,13 @@ def choose_robot(
             )
         usual = RobotConvention(cameras, {})
     if cameras is None and config == "pi0_aloha_sim":
-        cameras = _ALOHA_SIM
+        cameras = {"images.cam_high": "front"}  # the simulation has one camera
     known = [key for key in usual.cameras if key not in usual.optional or cameras is None or key in cameras]
     return replace(
         usual,
         cameras=choose_cameras(cameras, usual.cameras, known),
         state=usual.state if state is None else state,
-        layout=layout or usual.layout,
+        layout=settings.layout or usual.layout,
     )
 
 
@@ -126,7 +120,9 @@ class Transforms:
     def of(cls, config: Any, folder: Path) -> Transforms:
         """Read the transforms; raises `ConfigError` if the checkpoint lacks statistics of the config's asset."""
         openpi = require("openpi.transforms")
-        data = _data_config(config, folder)
+        # with the checkpoint's statistics: openpi itself would first look online
+        here = dataclasses.replace(config.data.assets, assets_dir=str(folder / "assets"))
+        data = dataclasses.replace(config.data, assets=here).create(config.assets_dirs, config.model)
         statistics = _statistics(folder, data.asset_id)
         quantiles = data.use_quantile_norm
         try:
@@ -200,13 +196,6 @@ def _with(observation: dict[str, Any], instruction: str) -> dict[str, Any]:
     return data | {"prompt": instruction} if instruction else data
 
 
-def _data_config(config: Any, folder: Path) -> Any:
-    """Return the config's data config with the checkpoint's statistics; openpi itself would first look online."""
-    factory = config.data
-    here = dataclasses.replace(factory.assets, assets_dir=str(folder / "assets"))
-    return dataclasses.replace(factory, assets=here).create(config.assets_dirs, config.model)
-
-
 def _statistics(folder: Path, asset: str | None) -> Any:
     if asset is None:
         raise ConfigError("config: has no asset_id, so that nothing says which statistics are its own; set one")
@@ -250,11 +239,6 @@ class OpenPiConfig(ModelConfig):
     max_decoding_steps: int = Field(default=256, ge=1, description="largest number of tokens of a chunk (pi0-FAST)")
     guidance: Guidance = 5.0
     noise_level: NoiseLevel = 0.0
-    batch_sizes: list[int] | None = Field(
-        default=None,
-        description="the only numbers of rows to run; unset: for JAX, or compiled, those of the "
-        "deployment's `batch`, else any",
-    )
 
 
 logger = logging.getLogger(__name__)
@@ -269,10 +253,10 @@ class SampleBatch:
     """The inputs of a model for B chunks."""
 
     inputs: dict[str, Any]  # of P observations
+    rows: Sequence[Row]  # with plans in the model's units
     noise: np.ndarray  # one array for each row
-    guide: Guide | None  # of the rows, if any of them follows a plan
     owners: Sequence[int]  # the observation of each row, as of `ModelPolicy.observations_of`
-    random: RandomSteps | None  # the result of `random_steps` for the rows
+    dim: int | None  # how many numbers of an action are the robot's
 
 
 class OpenPiModel(abc.ABC):
@@ -283,12 +267,8 @@ class OpenPiModel(abc.ABC):
     trained: Any  # what a learner trains: the torch module, or the dicts of arrays that JAX checkpoints have
 
     @abc.abstractmethod
-    def sample(self, batch: SampleBatch) -> np.ndarray:
-        """Compute actions (B, H, action_dim), or tokens (B, T)."""
-
-    def random_steps(self, rows: Sequence[Row], noise_level: float) -> RandomSteps | None:
-        """Return the random steps of rows for which outputs are requested; None if there are none."""
-        return None
+    def sample(self, batch: SampleBatch) -> tuple[np.ndarray, dict[int, dict[str, Any]]]:
+        """Compute actions (B, H, action_dim), or tokens (B, T), and the outputs requested of rows, by their places."""
 
 
 class JaxFlow(OpenPiModel):
@@ -335,7 +315,9 @@ class JaxFlow(OpenPiModel):
                     adarms_cond=[None, condition],
                 )
                 velocity = model.action_out_proj(hidden[:, -noise.shape[1] :])
-                velocity = guide.steer(velocity, actions, noise, time, steps=steps, limit=limit, lower=jnp.minimum)
+                velocity = guide.steer(
+                    velocity, actions, time, noise=noise, steps=steps, limit=limit, lower=jnp.minimum
+                )
                 return actions - velocity / steps, time - 1 / steps
 
             return jax.lax.while_loop(lambda now: now[1] >= 0.5 / steps, step, (noise, 1.0))[0]
@@ -347,9 +329,9 @@ class JaxFlow(OpenPiModel):
         self._encode, self._gather, self._follow = jax.jit(encode), jax.jit(gather), jax.jit(follow)
         self.noise_shape = (network.action_horizon, network.action_dim)
 
-    def sample(self, batch: SampleBatch) -> np.ndarray:
+    def sample(self, batch: SampleBatch) -> tuple[np.ndarray, dict[int, dict[str, Any]]]:
         """Compute actions (B, H, action_dim) float32; a batch without plans runs the same program without guidance."""
-        jax, guide = require("jax"), batch.guide
+        jax, guide = require("jax"), Guide.of(batch.rows, *batch.noise.shape[1:])
         if guide is None:
             none = np.zeros((*batch.noise.shape[:2], 1), np.float32)
             guide = Guide(np.zeros_like(batch.noise), none, none)
@@ -358,7 +340,7 @@ class JaxFlow(OpenPiModel):
         encoded = self._encode(self.trained, inputs)
         if len(encoded[0]) < len(owners):
             encoded = self._gather(encoded, owners)
-        return np.asarray(self._follow(self.trained, encoded, noise, plan), np.float32)  # waits for the device
+        return np.asarray(self._follow(self.trained, encoded, noise, plan), np.float32), {}  # waits for the device
 
 
 class JaxTokens(OpenPiModel):
@@ -373,9 +355,9 @@ class JaxTokens(OpenPiModel):
 
         self._sample = jax.jit(sample)
 
-    def sample(self, batch: SampleBatch) -> np.ndarray:
-        jax = require("jax")
-        return self.ended(np.asarray(self._sample(self.trained, jax.device_put(batch.inputs, self._device)), np.int32))
+    def sample(self, batch: SampleBatch) -> tuple[np.ndarray, dict[int, dict[str, Any]]]:
+        tokens = self._sample(self.trained, require("jax").device_put(batch.inputs, self._device))
+        return self.ended(np.asarray(tokens, np.int32)), {}
 
     @staticmethod
     def ended(tokens: np.ndarray) -> np.ndarray:
@@ -392,24 +374,21 @@ class TorchFlow(OpenPiModel):
     def __init__(self, network: Any, device: Any, config: OpenPiConfig, compilation: Compilation) -> None:
         self.trained, self._device = network, device
         self._passes = Pi0Passes(network, compilation)
-        self._steps, self._limit = config.steps or _STEPS, config.guidance
-        self.noise_shape: tuple[int, int] = (network.config.action_horizon, network.config.action_dim)
+        self._config, self.noise_shape = config, (network.config.action_horizon, network.config.action_dim)
 
-    def sample(self, batch: SampleBatch) -> np.ndarray:
-        jax, torch = require("jax"), require("torch")
-        observation = _observation(jax.tree.map(self._convert, batch.inputs))
-        start, changes = self._convert(batch.noise), list[Change]()
-        if batch.guide is not None:
-            changes.append(batch.guide.to(self._convert).change(start, steps=self._steps, limit=self._limit))
-        if batch.random is not None:
-            changes.append(batch.random.change)
-        with torch.inference_mode():
-            inputs = self.trained._preprocess_observation(observation, train=False)
-            flow = self._passes.sample(*inputs, noise=start, owners=batch.owners, steps=self._steps, changes=changes)
-        return fetch(flow.float())
-
-    def random_steps(self, rows: Sequence[Row], noise_level: float) -> RandomSteps | None:
-        return RandomSteps.of(rows, (self._steps, *self.noise_shape), noise_level, self._convert)
+    def sample(self, batch: SampleBatch) -> tuple[np.ndarray, dict[int, dict[str, Any]]]:
+        observation = _observation(require("jax").tree.map(self._convert, batch.inputs))
+        with require("torch").inference_mode():
+            return self._passes.chunks(
+                batch.rows,
+                self.trained._preprocess_observation(observation, train=False),
+                batch.owners,
+                noise=batch.noise,
+                steps=self._config.steps or _STEPS,
+                config=self._config,
+                dim=batch.dim,
+                convert=self._convert,
+            )
 
     def _convert(self, array: np.ndarray) -> Any:
         """Return a copy of the array as a tensor on the device."""
@@ -509,15 +488,6 @@ class SeenObs:
     inputs: dict[str, Any]
 
 
-@dataclass(frozen=True)
-class TransformedRow:
-    """A row in the form of the model's inputs."""
-
-    inputs: dict[str, Any]
-    row: Row  # with its leftover actions in the model's units
-    noise: np.ndarray
-
-
 class OpenPi(ModelPolicy):
     """The policies of openpi, with one call of the model for many sessions."""
 
@@ -552,8 +522,7 @@ class OpenPi(ModelPolicy):
         config = train_config(self.config.config)
         folder = self._folder()
         transforms = Transforms.of(config, folder)
-        ours = self.config
-        robot = choose_robot(config.name, transforms.robot, ours.cameras, ours.state, ours.layout)
+        robot = choose_robot(config.name, transforms.robot, self.config)
         found = attempt(transforms.ranges, robot)  # a transform of the user's own may want more of an observation
         if isinstance(found, Exception):
             logger.warning("the statistics of the training are not stated: %s: %s", type(found).__name__, found)
@@ -584,36 +553,27 @@ class OpenPi(ModelPolicy):
         if (spare := next((one for one in read if not isinstance(one, Exception)), None)) is None:
             return read  # errors all
         # A valid row replaces an invalid one, so that the number of rows stays one that is compiled.
-        spare = replace(spare, row=replace(spare.row, want=()))
-        flows, stated = self._sample([spare if isinstance(one, Exception) else one for one in read])
-        actions = self.loaded().transforms.actions
+        spare = replace(spare[0], want=()), spare[1]
+        ready, noise = zip(*(spare if isinstance(one, Exception) else one for one in read), strict=True)
+        loaded, each = self.loaded(), list(range(len(ready)))
+        firsts, owners = self.observations_of(ready) if loaded.model.shares else (each, each)
+        inputs = [row.frames[-1].inputs for row in ready]
+        batch = require("jax").tree.map(lambda *leaves: np.stack(leaves), *(inputs[i] for i in firsts))
+        flows, stated = loaded.model.sample(SampleBatch(batch, ready, np.stack(noise), owners, loaded.robot.action.dim))
         return [
             one
             if isinstance(one, Exception)
-            else Prediction(actions(one.inputs["state"], flow), behaviour=stated.get(i, {}))
-            for i, (one, flow) in enumerate(zip(read, flows, strict=True))
+            else Prediction(loaded.transforms.actions(own["state"], flow), behaviour=stated.get(i, {}))
+            for i, (one, own, flow) in enumerate(zip(read, inputs, flows, strict=True))
         ]
 
-    def _planned(self, row: Row) -> TransformedRow:
-        """Return the row with its leftover actions in the model's units."""
-        loaded, seen = self.loaded(), row.frames[-1]
+    def _planned(self, row: Row) -> tuple[Row, np.ndarray]:
+        """Return the row with its leftover actions in the model's units, and its noise."""
+        loaded = self.loaded()
         if row.leftover is not None:
-            row = replace(row, leftover=loaded.transforms.plan(seen.raw, row.instruction, row.leftover))
-        return TransformedRow(seen.inputs, row, row.noise(*loaded.model.noise_shape or ()))
-
-    def _sample(self, ready: Sequence[TransformedRow]) -> tuple[np.ndarray, dict[int, dict[str, Any]]]:
-        """Return the model's output for rows, and the requested extra outputs by the index of the row."""
-        model, rows = self.loaded().model, [one.row for one in ready]
-        each = list(range(len(rows)))
-        firsts, owners = self.observations_of(rows) if model.shares else (each, each)
-        batch = require("jax").tree.map(lambda *leaves: np.stack(leaves), *(ready[i].inputs for i in firsts))
-        shape = model.noise_shape
-        guide = None if shape is None else Guide.of(rows, *shape)
-        random = model.random_steps(rows, self.config.noise_level)
-        noise = np.stack([one.noise for one in ready])
-        flows = model.sample(SampleBatch(batch, noise, guide, owners, random))
-        dim = self.loaded().robot.action.dim
-        return flows, {} if random is None else random.stated(self.config.execute, dim)
+            plan = loaded.transforms.plan(row.frames[-1].raw, row.instruction, row.leftover)
+            row = replace(row, leftover=plan)
+        return row, row.noise(*loaded.model.noise_shape or ())
 
     def _folder(self) -> Path:
         name, step = self.config.checkpoint, self.config.checkpoint_step

@@ -19,12 +19,13 @@ from vlagents_ray.contract import ActionSpec, Contract
 from vlagents_ray.errors import ConfigError, InvalidObservation
 from vlagents_ray.interface import Obs
 from vlagents_ray.policies.base import ModelConfig, ModelPolicy, Prediction, Row, shared_frames
-from vlagents_ray.policies.base.accelerator import ensure_torchvision, fetch, torch_device, torch_dtype
+from vlagents_ray.policies.base.accelerator import ensure_torchvision, torch_device, torch_dtype
 from vlagents_ray.policies.base.checkpoint import find_checkpoint, from_pretrained
 from vlagents_ray.policies.base.config import Guidance, NoiseLevel
 from vlagents_ray.policies.base.model_inputs import camera_images, choose_cameras, resize_with_pad, state_vector
 from vlagents_ray.policies.base.staging import StagedRow, Staging
-from vlagents_ray.policies.flow import OFFERED, FlowPasses, cache_of, layers_of, start_flow
+from vlagents_ray.policies.compilation import Compilation
+from vlagents_ray.policies.flow import OFFERED, FlowPasses, cache_of, layers_of, stack_of
 from vlagents_ray.registry import require
 
 CAMERAS = ("base_0_rgb", "left_wrist_0_rgb", "right_wrist_0_rgb")  # openpi's names, in the order of the image tokens
@@ -180,37 +181,23 @@ class Pi0(ModelPolicy):
         self._begun().prompt = {name: array[0] for name, array in tokens.items()}
 
     def predict(self, rows: Sequence[Row]) -> list[Prediction]:
-        model, torch = self.loaded(), require("torch")
-        shape = (model.network.config.chunk_size, model.network.config.max_action_dim)
-        noise, changes, random = start_flow(
-            [model.planned(row) for row in rows],
-            shape,
-            self._steps,
-            noise_level=self.config.noise_level,
-            limit=self.config.guidance,
-            convert=model.staging.upload,
-        )
-        firsts, owners = shared_frames(rows)
-        with torch.inference_mode():
+        model, (firsts, owners) = self.loaded(), shared_frames(rows)
+        settings = model.network.config
+        with require("torch").inference_mode():
             inputs = self._inputs([rows[i] for i in firsts])
-            flow = model.passes.sample(
-                [inputs["pixel_values"]],
-                inputs["pixel_attention_mask"].unbind(1),
-                inputs["input_ids"],
-                inputs["attention_mask"],
-                inputs["state"],
-                noise=noise,
-                owners=owners,
-                steps=self._steps,
-                changes=changes,
-                fingerprints=[row.adapter for row in rows],
+            cameras = inputs["pixel_attention_mask"].unbind(1)
+            others = (inputs[name] for name in ("input_ids", "attention_mask", "state"))
+            flows, stated = model.passes.chunks(
+                [model.planned(row) for row in rows],
+                [[inputs["pixel_values"]], cameras, *others],
+                owners,
+                noise=np.stack([row.noise(settings.chunk_size, settings.max_action_dim) for row in rows]),
+                steps=self.config.steps or settings.num_inference_steps,
+                config=self.config,
+                dim=len(model.processor.actions_mean),
+                convert=model.staging.upload,
             )
-            stated = {} if random is None else random.stated(self.config.execute, len(model.processor.actions_mean))
-        return [Prediction(model.actions(one), behaviour=stated.get(i, {})) for i, one in enumerate(fetch(flow))]
-
-    @property
-    def _steps(self) -> int:
-        return int(self.config.steps or self.loaded().network.config.num_inference_steps)
+        return [Prediction(model.actions(flow), behaviour=stated.get(i, {})) for i, flow in enumerate(flows)]
 
     def _inputs(self, rows: Sequence[Row]) -> Mapping[str, Any]:
         """Stack the last frames of rows, with their images scaled on the device as the image processor does."""
@@ -231,8 +218,7 @@ def _cameras(chosen: Mapping[str, str] | None) -> dict[str, str]:
     """Sort the cameras by the model's image tokens; a checkpoint may be trained without some of them."""
     asked = USUAL_CAMERAS if chosen is None else chosen
     known = [name for name in CAMERAS if name in asked] if asked and set(asked) <= set(CAMERAS) else CAMERAS
-    mapping = choose_cameras(chosen, USUAL_CAMERAS, known)
-    return {name: mapping[name] for name in known}
+    return choose_cameras(chosen, USUAL_CAMERAS, known)
 
 
 def _processor(path: Path) -> Any:
@@ -272,10 +258,21 @@ class Pi0HfPasses(FlowPasses):
     """
 
     def encode(self, tokens: Any, mask: Any, cameras: Any, state: Any, *images: Any) -> tuple[Any, Any]:
-        return encode(self.model, tokens, images[0], cameras, mask), mask
+        """Return keys and values (P, layers, 2, heads, L, E), and the mask; `images` is one (P, cameras, 3, S, S)."""
+        cache = self.model.model.vlm(
+            inputs_embeds=self.model.model.embed_prefix(tokens, images[0], cameras),
+            attention_mask=mask,
+            position_ids=mask.cumsum(-1) - 1,
+            token_type_ids=mask.new_zeros(mask.shape),
+            use_cache=True,
+        ).past_key_values
+        return stack_of(layers_of(cache)), mask
 
     def velocity(self, encoded: Any, seen: Any, state: Any, actions: Any, times: Any) -> Any:
-        return velocity_of(self.model, encoded, seen, state, actions.to(state.dtype), times)
+        cache = cache_of(encoded.unbind(1))  # of this step alone: later ones must not attend to it
+        noise = actions.to(state.dtype)
+        output = self.model(state=state, noise=noise, timestep=times, attention_mask=seen, past_key_values=cache)
+        return output.logits.float()
 
 
 def flow_velocity(
@@ -292,44 +289,16 @@ def flow_velocity(
     Returns:
         The function, whose result is (B, H, D) float32.
     """
-    torch = require("torch")
-    mask, state = inputs["attention_mask"], inputs["state"]
-    encoded = encode(network, inputs["input_ids"], inputs["pixel_values"], inputs["pixel_attention_mask"], mask)
+    torch, passes = require("torch"), Pi0HfPasses(network, Compilation(False))
+    names = ("input_ids", "attention_mask", "pixel_attention_mask", "state", "pixel_values")
+    encoded, mask = passes.encode(*(inputs[name] for name in names))
+    state = inputs["state"].to(dtype)
     if owners is not None:
         index = torch.tensor(owners, device=mask.device)
         encoded, mask, state = encoded[index], mask[index], state[index]
 
     def velocity(actions: Any, time: float) -> Any:
         times = torch.full((len(actions),), time, dtype=torch.float32, device=actions.device)
-        return velocity_of(network, encoded, mask, state, actions.to(dtype), times)
+        return passes.velocity(encoded, mask, state, actions, times)
 
     return velocity
-
-
-def encode(network: Any, tokens: Any, images: Any, cameras: Any, mask: Any) -> Any:
-    """Return the keys and values (P, layers, 2, heads, L, E) of tokens (P, L) and images where `mask` is not 0.
-
-    Args:
-        network: The `PI0ForConditionalGeneration`.
-        tokens: (P, L) int64.
-        images: (P, cameras, 3, S, S).
-        cameras: (P, cameras) bool, which images are present.
-        mask: (P, L), 0 for padding.
-    """
-    import torch  # the compiler follows an import statement, but not `require`
-
-    cache = network.model.vlm(
-        inputs_embeds=network.model.embed_prefix(tokens, images, cameras),
-        attention_mask=mask,
-        position_ids=mask.cumsum(-1) - 1,
-        token_type_ids=torch.zeros_like(mask),
-        use_cache=True,
-    ).past_key_values
-    return torch.stack([torch.stack(layer, 1) for layer in layers_of(cache)], 1)
-
-
-def velocity_of(network: Any, encoded: Any, mask: Any, state: Any, actions: Any, times: Any) -> Any:
-    """Return the velocity (B, H, D) float32 of noisy actions (B, H, D) at times (B,); see `encode` for the others."""
-    cache = cache_of(encoded.unbind(1))  # of this step alone: later ones must not attend to it
-    output = network(state=state, noise=actions, timestep=times, attention_mask=mask, past_key_values=cache)
-    return output.logits.float()

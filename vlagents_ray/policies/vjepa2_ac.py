@@ -7,7 +7,6 @@ import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass, replace
-from pathlib import Path
 from typing import Any, ClassVar
 
 import numpy as np
@@ -163,7 +162,10 @@ def read_checkpoint(config: VJepa2AcConfig) -> dict[str, dict[str, Any]]:
     """Read the tensors of the parts "encoder" and "predictor" of upstream's file; nothing is unpickled."""
     torch = require("torch")
     path = find_checkpoint(config.checkpoint, config.checkpoint_step, needs=("*.pt",))
-    file = path if path.is_file() else _only(path)
+    files = [path] if path.is_file() else sorted(path.glob("*.pt"))
+    if len(files) != 1:
+        raise ConfigError(f"checkpoint {path}: got {[file.name for file in files]}, want one .pt file; name it")
+    [file] = files
     try:
         parts = torch.load(file, map_location="cpu", weights_only=True)
     except Exception as error:  # the file may not be a zip file, or may be a pickle of other types
@@ -227,13 +229,6 @@ def usual_attention() -> Iterator[None]:
         yield
     finally:
         backend.sdp_kernel = setter
-
-
-def _only(folder: Path) -> Path:
-    files = sorted(folder.glob("*.pt"))
-    if len(files) != 1:
-        raise ConfigError(f"checkpoint {folder}: got {[file.name for file in files]}, want one .pt file; name it")
-    return files[0]
 
 
 Tensor = Any  # torch's

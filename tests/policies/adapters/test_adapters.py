@@ -311,7 +311,7 @@ def test_values_are_scaled_before_they_are_rounded(tmp_path: Path) -> None:
     tiny = {name: value * np.float32(1e-9) if ".lora_B." in name else value for name, value in values.items()}
     folder, x = save(tmp_path / "tiny", tiny, lora_alpha=2e9), small["see"].weight.new_tensor(np.eye(DIM))
     adapters, plain = Adapters(), small["see"](x)
-    adapters.load(small, {"tiny": str(folder)}, lambda source: (Adapter.of(source, "", ""), folder), lambda *_: None)
+    adapters.load(small, {"tiny": str(folder)}, lambda source: (Adapter(source, "a", "a"), folder), lambda *_: None)
     with adapters.rows([adapters.named("tiny").fingerprint] * DIM):
         change = small["see"](x) - plain
     down, up = (values[f"base_model.model.see.lora_{part}.weight"] for part in "AB")

@@ -28,7 +28,7 @@ def flow(*rows: Row, steps: int = STEPS, limit: float = 5.0) -> np.ndarray:
         time = 1.0 - step / steps
         velocity = (actions - TARGET) / time
         if guide is not None:
-            velocity = guide.steer(velocity, actions, noise, time, steps=steps, limit=limit)
+            velocity = guide.steer(velocity, actions, time, noise=noise, steps=steps, limit=limit)
         actions = actions - velocity / steps
     return actions
 

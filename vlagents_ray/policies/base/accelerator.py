@@ -52,9 +52,18 @@ def torch_device(name: str = "auto") -> Any:
             f"device {name!r}: not here ({said}); use 'auto' or 'cpu', or give the replica a GPU with "
             f"resources: {{num_gpus: 1}}"
         ) from error
-    if device.type == "cuda" and share:
-        torch.cuda.set_per_process_memory_fraction(share, device)
-    report_device(_described(torch, device))
+    described = {"kind": device.type, "device": str(device), "torch": torch.__version__}
+    if device.type == "cuda":
+        if share:
+            torch.cuda.set_per_process_memory_fraction(share, device)
+        properties = torch.cuda.get_device_properties(device)
+        described |= {
+            "name": properties.name,
+            "memory_mib": properties.total_memory // 2**20,
+            "cuda": torch.version.cuda or torch.version.hip,
+            "driver": driver_version(),
+        }
+    report_device(described)
     return device
 
 
@@ -80,19 +89,6 @@ def _unusable(library: str, said: str) -> ConfigError:
         f"device 'auto': this process was given GPU {_given_gpus()} ({VISIBLE}), which {library} cannot use: {said}; "
         f"install a build of it for the GPU and its driver, or set device: cpu with resources: {{num_gpus: 0}}"
     )
-
-
-def _described(torch: Any, device: Any) -> dict[str, Any]:
-    described = {"kind": device.type, "device": str(device), "torch": torch.__version__}
-    if device.type != "cuda":
-        return described
-    properties = torch.cuda.get_device_properties(device)
-    return described | {
-        "name": properties.name,
-        "memory_mib": properties.total_memory // 2**20,
-        "cuda": torch.version.cuda or torch.version.hip,
-        "driver": driver_version(),
-    }
 
 
 def driver_version() -> str | None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 import logging
 import os
@@ -14,7 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from vlagents_ray.errors import ConfigError
-from vlagents_ray.policies.adapters import FILES, Adapter, base_of
+from vlagents_ray.policies.adapters import DIGITS, FILES, Adapter, base_of
 from vlagents_ray.policies.base.checkpoint_files import digest, revision
 from vlagents_ray.registry import require
 
@@ -107,7 +108,9 @@ def find_adapter(source: str, checkpoint: str, base: Sequence[Path], digest_of_b
             f"{folder}: was trained on {trained_on!r}, want an adapter of {checkpoint!r}, the policy's checkpoint; "
             f"if these are the same weights, name it so as base_model_name_or_path in its adapter_config.json"
         )
-    return Adapter.of(source, digest_of_base, digest([folder]), revision(folder)), folder
+    own = digest([folder])
+    both = hashlib.sha256(f"{digest_of_base} {own}".encode()).hexdigest()
+    return Adapter(source, f"{own.partition(':')[0]}:{both}", both[:DIGITS], revision(folder)), folder
 
 
 def _is_other(trained_on: str, checkpoint: str, base: Sequence[Path], digest_of_base: str) -> bool:
@@ -179,11 +182,6 @@ class SavedTensors:
 
     def __getitem__(self, name: str) -> Any:
         return self._readers[name]()
-
-    def renamed(self, rename: Callable[[str], str | None]) -> SavedTensors:
-        """Return the tensors under other names; those that `rename` maps to None are dropped."""
-        named = {rename(key): reader for key, reader in self._readers.items()}
-        return SavedTensors({key: reader for key, reader in named.items() if key is not None})
 
 
 def _safetensors(folder: Path) -> list[Path]:

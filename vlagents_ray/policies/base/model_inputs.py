@@ -10,7 +10,7 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from vlagents_ray.contract import CameraSpec, Contract, StateSpec
+from vlagents_ray.contract import Contract, StateSpec
 from vlagents_ray.errors import ConfigError, InvalidObservation, MissingCamera, MissingState
 from vlagents_ray.interface import LEFTOVER, SAMPLES, WANT, Obs
 from vlagents_ray.policies.base.config import ModelConfig
@@ -73,15 +73,16 @@ def shared_frames(rows: Sequence[Row]) -> tuple[list[int], list[int]]:
 def choose_cameras(chosen: Mapping[str, str] | None, usual: Mapping[str, str], known: Sequence[str]) -> dict[str, str]:
     """Map the model's name of each camera to the observation's: `chosen`, or the family's usual mapping.
 
-    `known` are the model's cameras. An unknown or missing camera raises `ConfigError`; it is never replaced by zeros.
+    `known` are the model's cameras, in the order of the result. An unknown or missing camera raises `ConfigError`; it
+    is never replaced by zeros.
     """
-    mapping = dict(usual if chosen is None else chosen)
+    mapping = usual if chosen is None else chosen
     if set(mapping) != set(known):
         raise ConfigError(
             f"cameras: got {sorted(mapping)}, want {sorted(known)}, the checkpoint's own names, each with the name of "
             f"one of yours, as in cameras: {{{', '.join(f'{name}: …' for name in known)}}}"
         )
-    return mapping
+    return {name: mapping[name] for name in known}
 
 
 def camera_images(obs: Obs, cameras: Mapping[str, str]) -> dict[str, np.ndarray]:
@@ -119,11 +120,6 @@ def state_vector(obs: Obs, parts: Sequence[str], dim: int | None = None) -> np.n
             f"set the policy's `state` to the parts that it was trained with"
         )
     return vector
-
-
-def camera_specs(cameras: Mapping[str, str]) -> dict[str, CameraSpec]:
-    """Return the cameras of a contract: images of any size, which the adapter resizes as its family does."""
-    return {ours: CameraSpec() for ours in cameras.values()}
 
 
 def needs_gripper(parts: Sequence[str]) -> bool:

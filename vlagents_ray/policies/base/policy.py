@@ -18,8 +18,8 @@ from typing import Any, ClassVar, TypeVar
 import numpy as np
 
 from vlagents_ray.chunking.buffer import ENSEMBLE, Chunk, ChunkBuffer
-from vlagents_ray.contract import Contract
-from vlagents_ray.errors import ConfigError, InvalidAction, InvalidObservation, NotReset, PolicyFailed
+from vlagents_ray.contract import CameraSpec, Contract
+from vlagents_ray.errors import ConfigError, InvalidAction, InvalidObservation, NotReset, NotTrainable, PolicyFailed
 from vlagents_ray.interface import BEHAVIOUR, DELAY, DISTRIBUTION, EXECUTED, LEFTOVER, Act, Agent, Obs
 from vlagents_ray.policies.adapters import ADAPTER, DIGITS, Adapters
 from vlagents_ray.policies.base.accelerator import free_memory, gpu_timer, is_out_of_memory, set_matmul
@@ -28,7 +28,6 @@ from vlagents_ray.policies.base.checkpoint_files import weights_of
 from vlagents_ray.policies.base.config import ModelConfig
 from vlagents_ray.policies.base.model_inputs import (
     Row,
-    camera_specs,
     count_in,
     drawn,
     leftover_plan,
@@ -38,7 +37,7 @@ from vlagents_ray.policies.base.model_inputs import (
     wanted_behaviour,
     wanted_samples,
 )
-from vlagents_ray.policies.compilation import Compilation, quantize, require_whole
+from vlagents_ray.policies.compilation import Compilation, quantize
 from vlagents_ray.policies.loading import COMPILED_SIZES, LoadingReport, current_report, report_progress
 from vlagents_ray.policies.outcomes import attempt
 from vlagents_ray.validation import check_action
@@ -137,7 +136,7 @@ class ModelPolicy(Agent, abc.ABC):
             facts: Further fields of the contract, or other values of these.
         """
         usual: dict[str, Any] = {
-            "cameras": camera_specs(cameras),
+            "cameras": {ours: CameraSpec() for ours in cameras.values()},  # of any size: families resize them
             "state": state_specs(parts, self.state_dim),
             "gripper": needs_gripper(parts),
             "instruction": True,
@@ -258,7 +257,10 @@ class ModelPolicy(Agent, abc.ABC):
         self.model, self.adapters, self.compilation = None, Adapters(), Compilation(self.config.compile)
 
     def _trainable(self) -> Any:
-        require_whole(self.config.quantization)
+        if (kind := self.config.quantization) is not None:
+            raise NotTrainable(
+                f"quantization {kind!r}: weights of 8 bits cannot be replaced by a learner's; leave it out"
+            )
         return self.adapters.trainable if self.config.adapters else super()._trainable()
 
     def adapt(self, adapter: str, folder: Path) -> None:
@@ -275,12 +277,11 @@ class ModelPolicy(Agent, abc.ABC):
     def _load_with_adapters(self) -> Any:
         with used_checkpoints() as base:
             self.model = self.load()
-        weights = weights_of(base) or {"digest": ""}
-        find = partial(
-            find_adapter, checkpoint=self.config.checkpoint, base=base, digest_of_base=weights["digest"] or ""
-        )
+        weights = weights_of(base) or {}
+        digest = weights.get("digest") or ""
+        find = partial(find_adapter, checkpoint=self.config.checkpoint, base=base, digest_of_base=digest)
         self.adapters.load(attrgetter(self.network or "")(self), self.config.adapters, find, self.adapt)
-        self.adapters.base = (weights["digest"] or "").rpartition(":")[2][:DIGITS]
+        self.adapters.base = digest.rpartition(":")[2][:DIGITS]
         self.weights_id = {**weights, "adapters": self.adapters.ids} if base else None
         return self.model
 
@@ -407,7 +408,8 @@ class ModelPolicy(Agent, abc.ABC):
             began = time.perf_counter()
             with self.report.timer():
                 results = self.predict(filled)
-            self.report.record_pass(len(filled), time.perf_counter() - began)
+            shortest, took = self.report.pass_s, time.perf_counter() - began
+            shortest[len(filled)] = min(took, shortest.get(len(filled), took))
             if len(results) != len(filled):
                 raise PolicyFailed(f"predict: got {len(filled)} rows, returned {len(results)} chunks")
             found += results[: len(part)]
@@ -428,7 +430,9 @@ class ModelPolicy(Agent, abc.ABC):
 
     def _run_examples(self, size: int, seeds: Iterator[int]) -> None:
         rows = [self._example(next(seeds)) for _ in range(size)]
-        self._chunks(rows)
+        for prediction in self._forward(rows):
+            if isinstance(prediction, Exception):
+                raise prediction
         if any("jax" in device for device in self.report.devices) and size <= self.most_rows:
             for few in (few for few in self.config.batch_sizes or () if few < size):  # JAX compiles for each such pair
                 self.predict([*rows[:few], *(drawn(rows[0], row.rng) for row in rows[few:])])  # its duration is another
@@ -441,15 +445,6 @@ class ModelPolicy(Agent, abc.ABC):
         firsts, owners = shared_frames(rows)
         firsts, each = self.padded(firsts), list(range(len(rows)))
         return (each, each) if len(firsts) == len(rows) else (firsts, owners)
-
-    def _chunks(self, rows: Sequence[Row]) -> list[np.ndarray]:
-        """Return the chunks of rows; raises the first error of a row."""
-        chunks = []
-        for prediction in self._forward(list(rows)):
-            if isinstance(prediction, Exception):
-                raise prediction
-            chunks.append(prediction.actions)
-        return chunks
 
     def _example(self, seed: int, instruction: str = "warm up") -> Row:
         """Return a row for the warm-up: random images, and a random state near zero, that fit the contract."""

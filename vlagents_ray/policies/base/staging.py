@@ -81,20 +81,18 @@ class Staging:
                 raise ValueError(f"stack: got rows of {layout} and {row.layout}, want the same arrays in each")
             if row.block is None:  # of an earlier batch, or of a session that another replica began
                 self._copy(row)
-        blocks = [row.block for row in rows]
+        blocks, memory = [row.block for row in rows], None
         if self._stream is not None:
             current = torch.cuda.current_stream(self.device)
             for row in rows:
                 current.wait_event(row.copied)
                 row.block.record_stream(current)  # its memory is the other stream's
-            batch = torch.stack(blocks)
         elif self.device.type == "cpu":  # where fresh memory costs more than the copies
             if self._batch is None or self._batch.shape[1] != len(blocks[0]) or len(self._batch) < len(blocks):
                 with torch.inference_mode(False):  # so that any later batch may be written
                     self._batch = torch.empty(len(blocks), len(blocks[0]), dtype=torch.uint8)
-            batch = torch.stack(blocks, out=self._batch[: len(blocks)])
-        else:
-            batch = torch.stack(blocks)
+            memory = self._batch[: len(blocks)]
+        batch = torch.stack(blocks, out=memory)
         for row in () if keep else rows:
             row.block = row.copied = None
         starts = zip(_starts(rows[0]), rows[0].items(), strict=False)

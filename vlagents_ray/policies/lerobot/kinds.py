@@ -22,7 +22,7 @@ from vlagents_ray.policies.base.accelerator import fetch
 from vlagents_ray.policies.base.model_inputs import GRIPPER
 from vlagents_ray.policies.base.staging import Staging
 from vlagents_ray.policies.compilation import Compilation
-from vlagents_ray.policies.flow import Change, FlowPasses, Guide, Pi0Passes, RandomSteps, cache_of, layers_of
+from vlagents_ray.policies.flow import Change, FlowPasses, Guide, Pi0Passes, RandomSteps, cache_of, layers_of, stack_of
 from vlagents_ray.registry import require
 
 LONGEST_PREFIX = "rtc_training_max_delay"  # the config's field, of LeRobot after 0.6.1, for π0.5; 0: without prefixes
@@ -184,29 +184,21 @@ class Flow(Kind):
 
     def __init__(self, policy: Any, compilation: Compilation) -> None:
         super().__init__(policy, compilation)
-        self.guidance = Guidance(policy.rtc_processor)
-        model = policy.model
+        model, config = policy.model, self.config
         if policy.name == "smolvla":
             self.passes: FlowPasses = SmolVLAPasses(model, compilation)
         else:
             self.passes = Pi0Passes(model, compilation, stated=policy.name == "pi0")
-        memories = [name for name in _MEMORIES if getattr(policy.config, name, False)]
-        if memories:
+        self.flow_steps = int(config.num_steps if policy.name == "smolvla" else config.num_inference_steps)
+        if memories := [name for name in _MEMORIES if getattr(config, name, False)]:
             raise ConfigError(
                 f"checkpoint: has {memories}, want none: the policy object keeps them, so that sessions would mix"
             )
-
         # The policy calls it after preparing the inputs and before converting the actions.
         model.sample_actions = self.passes.sample
         trained = getattr(policy.rtc_processor.rtc_config, "mode", "guided") == "trained"
-        self.longest = int(getattr(policy.config, LONGEST_PREFIX)) if trained else 0  # rows of a prefix
+        self.longest = int(getattr(config, LONGEST_PREFIX)) if trained else 0  # rows of a prefix
         self.passes.by_row = trained
-
-    @property
-    def flow_steps(self) -> int:
-        """The number of steps from noise to actions."""
-        config = self.config
-        return int(config.num_steps if config.type == "smolvla" else config.num_inference_steps)
 
     def observations(self, rows: Sequence[Row]) -> list[int]:
         return self._shared(rows)[0]
@@ -228,7 +220,8 @@ class Flow(Kind):
                 noise, given = prefixes.given(noise), prefixes.frozen
                 changes.append(prefixes.keep)
             else:
-                changes.append(self.guidance.towards(plans, [row.delay for row in rows], shape, convert))
+                delays = [row.delay for row in rows]
+                changes.append(guided(self.policy.rtc_processor, plans, delays, shape, convert))
         if self.random is not None:
             changes.append(self.random.change)
         return self.policy.predict_action_chunk(
@@ -259,39 +252,33 @@ class Flow(Kind):
         return self.policy._pi_aloha_encode_actions_inv(left[None].clone())[0]
 
 
-class Guidance:
-    """Guides chunks like the `RTCProcessor` of a LeRobot flow-matching policy, with the settings of that processor."""
+def guided(processor: Any, plans: Sequence[Any], delays: Sequence[int], shape: tuple[int, int], convert: Any) -> Change:
+    """Return the change of velocities that leads chunks to the leftovers of their sessions, as LeRobot does.
 
-    def __init__(self, processor: Any) -> None:
-        self._processor = processor  # supplies settings and schedule
+    Args:
+        processor: The policy's `RTCProcessor`, for its settings and its schedule.
+        plans: The leftover of each of the B rows in the policy's units, (H', D'), or None.
+        delays: For each row, the number of actions that will have been executed.
+        shape: Rows and numbers of a chunk, (H, D).
+        convert: Makes a tensor of an array, on the policy's device.
+    """
+    torch, settings = require("torch"), processor.rtc_config
+    target, weights = torch.zeros(len(plans), *shape), torch.zeros(len(plans), shape[0], 1)
+    for i, (plan, delay) in enumerate(zip(plans, delays, strict=True)):
+        if plan is not None:
+            part = plan[: shape[0]]
+            target[i, : len(part), : part.shape[1]] = part
+            horizon = min(settings.execution_horizon, len(part))
+            weights[i, :, 0] = processor.get_prefix_weights(max(delay, 0), horizon, shape[0])
+    target, weights = convert(target.numpy()), convert(weights.numpy())
+    most = float(settings.max_guidance_weight)
 
-    def towards(self, plans: Sequence[Any], delays: Sequence[int], shape: tuple[int, int], convert: Any) -> Change:
-        """Return the change of velocities that leads chunks to the leftovers of their sessions.
+    def change(velocity: Any, actions: Any, time: float) -> Any:
+        end, done = actions - time * velocity, 1 - time
+        strength = most if done == 0 else min(most, time / done * (time**2 + done**2) / time**2)
+        return velocity - strength * weights * (target - end)
 
-        Args:
-            plans: The leftover of each of the B rows in the policy's units, (H', D'), or None.
-            delays: For each row, the number of actions that will have been executed.
-            shape: Rows and numbers of a chunk, (H, D).
-            convert: Makes a tensor of an array, on the policy's device.
-        """
-        torch = require("torch")
-        settings = self._processor.rtc_config
-        target, weights = torch.zeros(len(plans), *shape), torch.zeros(len(plans), shape[0], 1)
-        for i, (plan, delay) in enumerate(zip(plans, delays, strict=True)):
-            if plan is not None:
-                part = plan[: shape[0]]
-                target[i, : len(part), : part.shape[1]] = part
-                horizon = min(settings.execution_horizon, len(part))
-                weights[i, :, 0] = self._processor.get_prefix_weights(max(delay, 0), horizon, shape[0])
-        target, weights = convert(target.numpy()), convert(weights.numpy())
-        most = float(settings.max_guidance_weight)
-
-        def change(velocity: Any, actions: Any, time: float) -> Any:
-            end, done = actions - time * velocity, 1 - time
-            strength = most if done == 0 else min(most, time / done * (time**2 + done**2) / time**2)
-            return velocity - strength * weights * (target - end)
-
-        return change
+    return change
 
 
 class SmolVLAPasses(FlowPasses):
@@ -318,8 +305,6 @@ class SmolVLAPasses(FlowPasses):
         return found
 
     def encode(self, tokens: Any, mask: Any, cameras: Any, state: Any, *patches: Any) -> tuple[Any, Any]:
-        import torch  # the compiler follows an import statement, but not `require`
-
         embedded, seen, causal = self.model.embed_prefix(patches, cameras.unbind(1), tokens, mask, state=state)
         _, cache = self.model.vlm_with_expert.forward(
             attention_mask=self.module.make_att_2d_masks(seen, causal),
@@ -332,7 +317,7 @@ class SmolVLAPasses(FlowPasses):
             layers = [(layer["key_states"], layer["value_states"]) for layer in cache.values()]
         else:
             layers = layers_of(cache)
-        return torch.stack([torch.stack(layer, 1) for layer in layers], 1), seen.long()
+        return stack_of(layers), seen.long()
 
     def velocity(self, encoded: Any, seen: Any, state: Any, actions: Any, times: Any) -> Any:
         layers = encoded.unbind(1)

@@ -65,8 +65,9 @@ class LeRobot(ModelPolicy):
     @property
     def continues_plans(self) -> bool:
         loaded: LoadedLeRobot | None = self.model
-        flows = loaded is not None and isinstance(loaded.kind, kinds.Flow) and loaded.processors.invertible
-        return flows and self.config.actions == "chunk"
+        if loaded is None or not isinstance(loaded.kind, kinds.Flow):
+            return False
+        return loaded.processors.inverse is not None and self.config.actions == "chunk"
 
     @property
     def history(self) -> int:
@@ -75,12 +76,6 @@ class LeRobot(ModelPolicy):
     @property
     def state_dim(self) -> int | None:
         feature = None if self.model is None else self.model.kind.config.robot_state_feature
-        return None if feature is None else int(feature.shape[0])
-
-    @property
-    def environment_dim(self) -> int | None:
-        """The length of the environment's state; None if the policy reads none."""
-        feature = None if self.model is None else self.model.kind.config.env_state_feature
         return None if feature is None else int(feature.shape[0])
 
     def load(self) -> LoadedLeRobot:
@@ -173,7 +168,8 @@ class LeRobot(ModelPolicy):
         if model.state:
             frame[STATE] = model.trained.wrapped(model_inputs.state_vector(obs, model.state, self.state_dim))
         if model.environment:
-            frame[ENVIRONMENT] = model_inputs.state_vector(obs, model.environment, self.environment_dim)
+            width = int(model.kind.config.env_state_feature.shape[0])
+            frame[ENVIRONMENT] = model_inputs.state_vector(obs, model.environment, width)
         return model.kind.staging.stage(frame)
 
     def predict(self, rows: Sequence[Row]) -> list[Prediction | Exception]:

@@ -86,7 +86,7 @@ class Processors:
         absolute = [step for step in self._after.steps if type(step).__name__ == _ABSOLUTE and step.enabled]
         self._relative = absolute[0].relative_step if absolute else None  # holds the states of the last batch
         self.whole = self._groot or bool(absolute)  # whether actions are converted by whole chunks instead of rows
-        self._back = self._inverse()
+        self.inverse = self._inverse()
 
     def statistics(self, key: str) -> dict[str, list[float]]:
         """Return the statistics of a feature of the dataset; empty if there are none."""
@@ -147,20 +147,16 @@ class Processors:
         flat = self._after(chunks.float().flatten(0, 1))  # rows, as in LeRobot's own loop
         return fetch(flat.unflatten(0, chunks.shape[:2]).float())
 
-    @property
-    def invertible(self) -> bool:
-        return self._back is not None
-
     def leftover(self, row: Row) -> Any:
         """Convert the leftover actions of a row, (H, D'), to the policy's units; None if that is not possible."""
-        if self._back is None or row.leftover is None:
+        if self.inverse is None or row.leftover is None:
             return None
         rows = require("torch").from_numpy(row.leftover)
         if self._relative is not None:  # relative to the state in which the sampled chunk begins
             state = require("torch").from_numpy(row.frames[-1][STATE])
             mask = self._relative._build_mask(rows.shape[-1])
             rows = require("lerobot.processor").to_relative_actions(rows, state[None], mask)
-        return self._back(rows)
+        return self.inverse(rows)
 
     def width(self, dim: int) -> int:
         """Return D', the number of values of the robot's actions, for a policy with `dim` values."""

@@ -64,8 +64,7 @@ class OpenVLAOFT(prismatic.PrismaticPolicy):
         super().__init__(config)
         chosen = config.cameras or _USUAL
         known = [name for name in _CAMERAS if name in chosen or name == _PRIMARY]
-        mapping = choose_cameras(config.cameras, _USUAL, known)
-        self._cameras = {name: mapping[name] for name in known}
+        self._cameras = choose_cameras(config.cameras, _USUAL, known)
         self._state = list(_STATE if config.state is None else config.state)
 
     @property
@@ -77,7 +76,6 @@ class OpenVLAOFT(prismatic.PrismaticPolicy):
 
     @property
     def state_dim(self) -> int | None:
-        """The length of the state vector, as read by the projector; None before loading, or without a projector."""
         return None if self.model is None or self.model.proprio is None else self.model.proprio.dim
 
     def load(self) -> Parallel:

@@ -22,6 +22,7 @@ from vlagents_ray.policies.base import Prediction, Row
 from vlagents_ray.policies.base.model_inputs import camera_images, choose_cameras
 from vlagents_ray.policies.base.staging import StagedRow
 from vlagents_ray.policies.compilation import Compilation
+from vlagents_ray.policies.flow import stack_of
 from vlagents_ray.policies.openvla import prismatic
 from vlagents_ray.registry import require
 
@@ -162,7 +163,7 @@ class TokenDecoder:
             position_ids=(mask.cumsum(-1) - 1).clamp(min=0),
             use_cache=True,
         )
-        return result.last_hidden_state[:, -1], _stacked(result.past_key_values)
+        return result.last_hidden_state[:, -1], stack_of(result.past_key_values)
 
     def continue_from(self, tokens: Any, positions: Any, mask: Any, cache: Any) -> tuple[Any, Any]:
         """Run the language model on one more token (R,) of each row, at `positions` (R,) of its text.
@@ -178,7 +179,7 @@ class TokenDecoder:
             use_cache=True,
         )
         own = tuple((keys[:, :, -1:], values[:, :, -1:]) for keys, values in result.past_key_values)
-        return result.last_hidden_state[:, -1], _stacked(own)[..., 0, :]
+        return result.last_hidden_state[:, -1], stack_of(own)[..., 0, :]
 
     def _left_padded(self, prompts: Sequence[tuple[StagedRow, list[int]]]) -> tuple[Any, Any]:
         """Return embeddings (P, L, D) and their mask (P, L); the patches follow the first token, as in training."""
@@ -204,10 +205,3 @@ def _causal_mask(own: Callable[..., Any], mask: Any, embeddings: Any, positions:
     hidden = hidden & ~hidden.all(-1, keepdim=True)  # padding attends to all: fast kernels give NaN for no token at all
     shown = torch.zeros_like(hidden, dtype=embeddings.dtype)
     return shown.masked_fill(hidden, torch.finfo(embeddings.dtype).min)[:, None]
-
-
-def _stacked(cache: Any) -> Any:
-    """Stack a model's keys and values (B, heads, L, E) of each layer into one tensor (B, layers, 2, heads, L, E)."""
-    import torch  # the compiler follows an import statement, but not `require`
-
-    return torch.stack([torch.stack(layer, 1) for layer in cache], 1)

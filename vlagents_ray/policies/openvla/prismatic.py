@@ -24,7 +24,7 @@ from pydantic import Field, model_validator
 from typing_extensions import Self
 
 from vlagents_ray.contract import ActionSpec
-from vlagents_ray.errors import ConfigError, InvalidObservation, NotReset
+from vlagents_ray.errors import ConfigError, InvalidObservation
 from vlagents_ray.interface import Obs
 from vlagents_ray.policies.base import ModelConfig, ModelPolicy, Prediction, Row
 from vlagents_ray.policies.base.accelerator import ensure_torchvision, fetch, torch_device, torch_dtype
@@ -423,12 +423,6 @@ class PrismaticPolicy(ModelPolicy):
     config: Any
     network = "model.base.network"
 
-    @property
-    def _checkpoint(self) -> Prismatic | None:
-        """The checkpoint; None before it is loaded."""
-        base: Prismatic | None = None if self.model is None else self.model.base
-        return base
-
     @abc.abstractmethod
     def _model_input(self, row: Row, key: str) -> Any:
         """Return the model's input for a row of the dataset `key`; an error fails only that row."""
@@ -467,7 +461,7 @@ class PrismaticPolicy(ModelPolicy):
                 f"{folder / FILE}: got actions of {sorted(dims[0])} numbers, want {sorted(dims[1])}, as the base's; "
                 f"merge the adapter into its base, and serve that as a checkpoint of its own"
             )
-        self._checkpoint.own[adapter] = own  # type: ignore[union-attr]
+        self.model.base.own[adapter] = own
 
     def _decoded(self, bins: ActionBins, prepared: Sequence[PreparedRow], tokens: Any, over: Any) -> list[Prediction]:
         """Return the chunks of action tokens (B, H, D) that were chosen by the logits of bins (B, H, D, bins)."""
@@ -485,9 +479,8 @@ class PrismaticPolicy(ModelPolicy):
         return chunks
 
     def _statistics(self, adapter: str = "") -> Statistics:
-        if (checkpoint := self._checkpoint) is None:
-            raise NotReset(f"{type(self).__name__}: not loaded; call initialize() first")
-        return checkpoint.own.get(adapter, checkpoint.statistics)
+        base: Prismatic = self.loaded().base
+        return base.own.get(adapter, base.statistics)
 
     def _default(self, adapter: str) -> str | None:
         """Return the dataset of the settings; None for an adapter with its own datasets."""
@@ -507,7 +500,7 @@ class PrismaticPolicy(ModelPolicy):
 
     def _action(self) -> ActionSpec:
         """Describe an action: its meaning depends on the dataset, except for the gripper of a single arm."""
-        dims = set() if self._checkpoint is None else self._statistics().action_dims(self.config.unnorm_key)
+        dims = set() if self.model is None else self._statistics().action_dims(self.config.unnorm_key)
         dim = dims.pop() if len(dims) == 1 else None
         single = dim == _SINGLE_ARM
         return ActionSpec(dim=dim, gripper_open=1.0 if single else None, gripper_closed=0.0 if single else None)

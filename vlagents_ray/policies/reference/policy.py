@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any, ClassVar
 
 import numpy as np
@@ -14,11 +13,11 @@ from vlagents_ray.contract import ActionSpec, Contract
 from vlagents_ray.errors import ConfigError
 from vlagents_ray.interface import Obs
 from vlagents_ray.policies.base import ModelConfig, ModelPolicy, Prediction, Row, model_inputs, shared_frames
-from vlagents_ray.policies.base.accelerator import fetch, torch_device, torch_dtype
+from vlagents_ray.policies.base.accelerator import torch_device, torch_dtype
 from vlagents_ray.policies.base.checkpoint import find_checkpoint
 from vlagents_ray.policies.base.config import Guidance, NoiseLevel
 from vlagents_ray.policies.base.staging import StagedRow, Staging
-from vlagents_ray.policies.flow import OFFERED, FlowPasses, start_flow
+from vlagents_ray.policies.flow import OFFERED, FlowPasses
 from vlagents_ray.policies.reference.checkpoint import (
     CAMERAS,
     CONFIG,
@@ -79,17 +78,9 @@ class Reference(ModelPolicy):
     def contract(self) -> Contract:
         if self.model is None:
             return Contract(instruction=True, history=1)
-        robot = self.model.robot
-        return Contract(
-            cameras=model_inputs.camera_specs(self.model.cameras),
-            state=model_inputs.state_specs(self.state, len(robot.state_mean)),
-            gripper=model_inputs.needs_gripper(self.state),
-            instruction=True,
-            action=ActionSpec(**robot.action),
-            chunk=self.chunk(self.model.checkpoint.sizes.horizon),
-            history=1,
-            behaviour=self.offered(OFFERED if self.config.noise_level else ()),
-        )
+        model, behaviour = self.model, self.offered(OFFERED if self.config.noise_level else ())
+        action, horizon = ActionSpec(**model.robot.action), model.checkpoint.sizes.horizon
+        return self.stated(model.cameras, self.state, horizon, action=action, behaviour=behaviour)
 
     @property
     def state_dim(self) -> int | None:
@@ -107,7 +98,12 @@ class Reference(ModelPolicy):
     def load(self) -> LoadedReference:
         folder = find_checkpoint(self.config.checkpoint, self.config.checkpoint_step, needs=[CONFIG, WEIGHTS])
         checkpoint = read_checkpoint(folder)
-        robot = _embodiment(checkpoint, self.config.embodiment, folder)
+        known, name = checkpoint.embodiments, self.config.embodiment
+        if name is None and len(known) == 1:
+            [name] = known
+        if name is None or name not in known:
+            raise ConfigError(f"embodiment: got {name!r}, want one of {sorted(known)}, those of {folder}")
+        robot = known[name]
         device = torch_device(self.config.device)
         from vlagents_ray.policies.reference.network import read_network  # imports torch
 
@@ -116,8 +112,7 @@ class Reference(ModelPolicy):
         network = network.eval().requires_grad_(False).to(device, dtype)
         passes = ReferencePasses(network, self.compilation)
         passes.adapters = self.adapters
-        chosen = model_inputs.choose_cameras(self.config.cameras, robot.cameras, CAMERAS)
-        cameras = {name: chosen[name] for name in CAMERAS}
+        cameras = model_inputs.choose_cameras(self.config.cameras, robot.cameras, CAMERAS)
         return LoadedReference(network, checkpoint, robot, cameras, dtype, passes, Staging(device))
 
     def _begin(self, instruction: str, seed: int, adapter: str = "") -> None:
@@ -138,34 +133,23 @@ class Reference(ModelPolicy):
         return staged
 
     def predict(self, rows: Sequence[Row]) -> list[Prediction]:
-        model, config, torch = self.loaded(), self.config, require("torch")
-        shape = (model.checkpoint.sizes.horizon, model.checkpoint.sizes.action)
-        noise, changes, random = start_flow(
-            rows,
-            shape,
-            config.steps,
-            noise_level=config.noise_level,
-            limit=config.guidance,
-            convert=model.staging.upload,
-        )
-        firsts, owners = shared_frames(rows)
+        model, torch, (firsts, owners) = self.loaded(), require("torch"), shared_frames(rows)
+        sizes = model.checkpoint.sizes
         with torch.inference_mode():
             inputs = self._inputs([rows[i] for i in firsts])
             tokens = inputs["tokens"]
-            flow = model.passes.sample(
-                inputs["images"].unbind(1),
-                [torch.ones(len(tokens), dtype=torch.bool, device=tokens.device)] * len(CAMERAS),
-                tokens,
-                tokens != 0,
-                inputs["state"],
-                noise=noise,
-                owners=owners,
-                steps=config.steps,
-                changes=changes,
-                fingerprints=[row.adapter for row in rows],
+            cameras = [torch.ones(len(tokens), dtype=torch.bool, device=tokens.device)] * len(CAMERAS)
+            flows, stated = model.passes.chunks(
+                rows,
+                [inputs["images"].unbind(1), cameras, tokens, tokens != 0, inputs["state"]],
+                owners,
+                noise=np.stack([row.noise(sizes.horizon, sizes.action) for row in rows]),
+                steps=self.config.steps,
+                config=self.config,
+                dim=sizes.action,
+                convert=model.staging.upload,
             )
-            stated = {} if random is None else random.stated(config.execute, shape[1])
-        return [Prediction(one, behaviour=stated.get(i, {})) for i, one in enumerate(fetch(flow))]
+        return [Prediction(flow, behaviour=stated.get(i, {})) for i, flow in enumerate(flows)]
 
     def _inputs(self, rows: Sequence[Row]) -> dict[str, Any]:
         """Stack the last frames of rows, in the type of the network."""
@@ -173,12 +157,3 @@ class Reference(ModelPolicy):
         inputs = model.staging.stack([row.frames[-1] for row in rows])
         images, state = pixels(inputs["images"]).to(model.dtype), inputs["state"].to(model.dtype)
         return {"tokens": inputs["tokens"], "images": images, "state": state}
-
-
-def _embodiment(checkpoint: Checkpoint, name: str | None, folder: Path) -> Embodiment:
-    known = checkpoint.embodiments
-    if name is None and len(known) == 1:
-        return next(iter(known.values()))
-    if name not in known:
-        raise ConfigError(f"embodiment: got {name!r}, want one of {sorted(known)}, those of {folder}")
-    return known[name]

@@ -98,6 +98,14 @@ class UpstreamClient(abc.ABC):
         rows = (output if isinstance(output, Mapping) else metadata).get("action_horizon")
         return rows if type(rows) is int and rows > 0 else None
 
+    def actions(self, reply: Any) -> np.ndarray:
+        """Return the actions of a reply that is a map; raises `MalformedMessage` if there is no such array."""
+        actions = reply.get("actions") if isinstance(reply, dict) else None
+        if not isinstance(actions, np.ndarray):
+            got = sorted(map(str, reply))[:8] if isinstance(reply, dict) else type(reply).__name__
+            raise self.unreadable(got, "a map with an array `actions`")
+        return actions
+
     def failed(self, text: object, got: str = "an error") -> PolicyFailed:
         """Log an error that the upstream sent, and return ours, without the upstream's details."""
         logger.error("upstream %s answered with %s: %s", self.options.url, got, str(text)[:_LOGGED])

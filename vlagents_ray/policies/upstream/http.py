@@ -127,8 +127,7 @@ class OpenVLAClient(HttpClient):
 
     @staticmethod
     def is_nested(key: str) -> bool:  # noqa: ARG004 - overrides
-        """Return False: an observation is one flat map."""
-        return False
+        return False  # an observation is one flat map
 
     def encode(self, observation: Mapping[str, Any]) -> bytes:
         return openvla.encode(observation)
@@ -150,10 +149,7 @@ class SGLangClient(HttpClient):
         return openpi.encode({"input": {"observation": observation}, "runtime": {"response_format": "raw"}})
 
     def decode(self, body: bytes) -> np.ndarray:
-        actions = openpi.decode(body, self.options.limits).get("actions")
-        if not isinstance(actions, np.ndarray):
-            raise self.unreadable(type(actions).__name__, "a map with an array `actions`")
-        return actions
+        return self.actions(openpi.decode(body, self.options.limits))
 
 
 class FlashRTClient(HttpClient):

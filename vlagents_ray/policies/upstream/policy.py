@@ -141,7 +141,7 @@ class Upstream(Agent):
         self.config = config
         client = config.client
         self._outgoing = Outgoing(config.keys(), client.is_nested, client.text_key)
-        self._state: dict[str, Any] = {"contract": _contract(self._outgoing.contract(), config.contract)}
+        self._state = {"contract": _contract(self._outgoing.contract(), config.contract)}
         self._lanes: Lanes | None = None
         self._sessions: SessionConnections | None = None
         self._session: str | None = None
@@ -150,27 +150,24 @@ class Upstream(Agent):
     @property
     def contract(self) -> Contract:
         """The contract from the mapping and the settings, with the length of a chunk if the upstream states it."""
-        contract: Contract = self._state["contract"]
-        return contract
+        return self._state["contract"]
 
     def initialize(self) -> None:
         """Connect to the upstreams; raises `ContractMismatch` if their metadata contradicts the mapping."""
-        key = None
-        if (name := self.config.key_env) is not None and not (key := os.environ.get(name)):
+        config, key = self.config, None
+        if (name := config.key_env) is not None and not (key := os.environ.get(name)):
             raise ConfigError(f"key_env: the environment variable {name!r} is not set; set it where the replica runs")
-
-        config = self.config
 
         def make(url: str) -> UpstreamClient:
             return config.client(ClientOptions(url, config.timeout_s, key))
 
-        if self.config.keeps_sessions:
-            self._sessions = SessionConnections(self.config.urls, make, self._check, self.config.retry_s)
-            self._sessions.start(self.config.connect_timeout_s)
+        if config.keeps_sessions:
+            self._sessions = SessionConnections(config.urls, make, self._check, config.retry_s)
+            self._sessions.start(config.connect_timeout_s)
         else:
-            clients = [make(url) for _ in range(self.config.connections) for url in self.config.urls]
-            self._lanes = Lanes(clients, self._check, self.config.retry_s)
-            self._lanes.start(self.config.connect_timeout_s)
+            clients = [make(url) for _ in range(config.connections) for url in config.urls]
+            self._lanes = Lanes(clients, self._check, config.retry_s)
+            self._lanes.start(config.connect_timeout_s)
 
     def reset(self, obs: Obs, instruction: str | None, **kwargs: Any) -> dict[str, Any]:
         """Begin an episode, also at the upstream if that keeps sessions."""
@@ -227,6 +224,5 @@ class Upstream(Agent):
 def _contract(mapped: Contract, stated: Mapping[str, Any]) -> Contract:
     """Return the contract of a mapping, overridden by the one in the deployment file."""
     own = {name: value for name, value in stated.items() if value is not None}
-    whole: dict[str, Any] = mapped.to_json() | own
-    whole["action"] = mapped.to_json()["action"] | own.get("action", {})
-    return Contract.from_json(whole)
+    found: dict[str, Any] = mapped.to_json()
+    return Contract.from_json(found | own | {"action": found["action"] | own.get("action", {})})

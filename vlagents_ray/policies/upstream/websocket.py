@@ -119,7 +119,7 @@ class OpenPiClient(WebSocketClient):
 
     def ask(self, observations: Sequence[Mapping[str, Any]]) -> list[Answer]:
         [observation] = observations
-        return [self._actions(self._call(observation))]
+        return [self.actions(self._call(observation))]
 
     def _call(self, message: Mapping[str, Any]) -> Any:
         self.send(openpi.encode(message))
@@ -145,13 +145,6 @@ class OpenPiClient(WebSocketClient):
             raise self.failed(reply.get("message"))
         return reply
 
-    def _actions(self, reply: Any) -> np.ndarray:
-        actions = reply.get("actions") if isinstance(reply, dict) else None
-        if not isinstance(actions, np.ndarray):
-            got = sorted(map(str, reply))[:8] if isinstance(reply, dict) else type(reply).__name__
-            raise self.unreadable(got, "a map with an array `actions`")
-        return actions
-
 
 class OpenPiBatchClient(OpenPiClient):
     """A client that sends `{"batch": [...]}`, as in openpi's pull request 941 and in our own dialect."""
@@ -159,7 +152,7 @@ class OpenPiBatchClient(OpenPiClient):
     batches: ClassVar[bool] = True
 
     def ask(self, observations: Sequence[Mapping[str, Any]]) -> list[Answer]:
-        actions = self._actions(self._call({"batch": list(observations)}))
+        actions = self.actions(self._call({"batch": list(observations)}))
         if actions.ndim != 3 or len(actions) != len(observations):
             raise self.unreadable(f"actions {actions.shape}", f"({len(observations)}, H, D), one chunk an observation")
         return list(actions)
@@ -181,7 +174,7 @@ class RoboArenaClient(OpenPiClient):
     def ask(self, observations: Sequence[Mapping[str, Any]]) -> list[Answer]:
         [observation] = observations
         reply = self._call({**observation, "endpoint": "infer", "session_id": self._session})
-        return [reply if isinstance(reply, np.ndarray) else self._actions(reply)]
+        return [reply if isinstance(reply, np.ndarray) else self.actions(reply)]
 
     def begin(self) -> None:
         self._session = uuid.uuid4().hex
