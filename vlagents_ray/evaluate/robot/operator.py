@@ -11,7 +11,7 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from importlib.resources import files as package_files
 from pathlib import Path
 from typing import Any, Literal, Protocol
@@ -70,9 +70,7 @@ class VisibleTrial:
 
     def to_json(self) -> dict[str, Any]:
         """Return the fields for JSON; for the start pictures, the names of the cameras."""
-        names = ("number", "total", "task", "scene", "attempt", "instruction", "setup", "seconds", "message")
-        fields = {name: getattr(self, name) for name in names}
-        return fields | {"rubric": dict(self.rubric), "start": sorted(self.start)}
+        return asdict(self) | {"rubric": dict(self.rubric), "start": sorted(self.start)}
 
 
 @dataclass(frozen=True, slots=True)
