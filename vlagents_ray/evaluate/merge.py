@@ -20,7 +20,7 @@ from vlagents_ray.evaluate.plan.config import canonical
 from vlagents_ray.evaluate.report.page import FILE as REPORT
 from vlagents_ray.evaluate.report.page import write_report
 from vlagents_ray.evaluate.results.changes import Change, changed, listed, policy_changes, program_changes
-from vlagents_ray.evaluate.results.database import FILE, SCHEMA, VERSION, insert
+from vlagents_ray.evaluate.results.database import FILE, create, insert
 from vlagents_ray.evaluate.results.reader import CellResults, Results, Run, Worker, episode_of, reading, table
 from vlagents_ray.evaluate.results.summary import Summary, stated, summarize, write_summary
 
@@ -97,7 +97,7 @@ def merge(out: Path, folders: Sequence[Path], *, keep_first: bool = False, accep
             "workers": merged.workers,
         }
         with storage.whole(out / FILE) as part, closing(sqlite3.connect(part)) as db:
-            db.executescript(f"BEGIN; {SCHEMA} PRAGMA user_version = {VERSION}; COMMIT;")
+            create(db)
             with db:
                 for name, row in ((name, row) for name, rows in tables.items() for row in rows):
                     insert(db, name, row)

@@ -32,16 +32,7 @@ from vlagents_ray.evaluate.results.changes import (
     program_changes,
     program_id,
 )
-from vlagents_ray.evaluate.results.database import (
-    FILE,
-    RUNNING,
-    SCHEMA,
-    VERSION,
-    WAIT_S,
-    insert,
-    lock,
-    require_readable,
-)
+from vlagents_ray.evaluate.results.database import FILE, RUNNING, WAIT_S, create, insert, lock, require_readable
 
 
 class Store(AbstractContextManager["Store"]):
@@ -266,7 +257,7 @@ class Store(AbstractContextManager["Store"]):
         db = sqlite3.connect(self._out / FILE, timeout=WAIT_S)  # by default each commit reaches the disk
         try:
             if db.execute("PRAGMA user_version").fetchone()[0] == 0:
-                db.executescript(f"BEGIN; {SCHEMA} PRAGMA user_version = {VERSION}; COMMIT;")
+                create(db)
             require_readable(self._out, db)
             self._require_resumable(db, config)
             stop = config.stop.model_dump_json() if config.stop else None
