@@ -122,25 +122,16 @@ Watch = Callable[[Phase, int], None]  # called with the phase that begins and th
 _ACTING, _STEPPING = failures.policy_side("act"), failures.env_side("step")  # entered at each step
 
 
-@dataclass(frozen=True, slots=True)
-class EpisodeSettings:
-    """The settings of episodes of one cell."""
-
-    execute: int | None = None  # rows of each action chunk that are executed, open loop; None: all
-    # Real-time mode, in which each episode's time passes while the policy computes (see `latency`); None: the
-    # environments wait for the policy.
-    clock: ClockConfig | None = None
-    reset_options: Mapping[str, Any] = field(default_factory=dict)  # of each reset of an environment
-    policy_options: Mapping[str, Any] = field(default_factory=dict)  # of each reset of the policy
-
-
 def run_episodes(
     env: BatchEnv,
     agent: Agent,
     sessions: Sequence[Agent],
     keys: Sequence[EpisodeKey],
-    settings: EpisodeSettings = EpisodeSettings(),
     *,
+    execute: int | None = None,
+    clock: ClockConfig | None = None,
+    reset_options: Mapping[str, Any] | None = None,
+    policy_options: Mapping[str, Any] | None = None,
     observers: Sequence[EpisodeObserver] = (),
     watch: Watch = lambda _phase, _steps: None,
     images: bool = True,
@@ -155,7 +146,11 @@ def run_episodes(
     Args:
         sessions: The session of each episode.
         keys: Environment, number and seed of each episode.
-        settings: The common settings of the episodes.
+        execute: The rows of each action chunk that are executed, open loop; None: all.
+        clock: Real-time mode, in which each episode's time passes while the policy computes (see `latency`); None: the
+            environments wait for the policy.
+        reset_options: The options of each reset of an environment.
+        policy_options: The options of each reset of the policy.
         observers: The observer of each episode, or none.
         watch: Called before each phase that may take long.
         images: Whether the observers need the images of every step. If not, the environments may leave out those
@@ -181,14 +176,14 @@ def run_episodes(
         contract = env.contract
         seen = env.reset(
             seeds=[key.seed for key in keys],
-            options=[options_of_reset(env, key.episode, settings.reset_options) for key in keys],
+            options=[options_of_reset(env, key.episode, reset_options) for key in keys],
         )
         first = [
             (failures.checked_obs(obs, contract, "reset"), failures.checked_instruction(text, "reset"))
             for obs, text in zip(seen, env.instructions, strict=True)
         ]
     reset_ms = 1e3 * (perf_counter() - begun)
-    executor = partial(ChunkExecutor, settings.execute, settings.clock, contract)
+    executor = partial(ChunkExecutor, execute, clock, contract)
     watched = observers or [EpisodeObserver()] * len(keys)
     episodes = []
     for i, (key, session, observer, (obs, text)) in enumerate(zip(keys, sessions, watched, first, strict=True)):
@@ -196,7 +191,7 @@ def run_episodes(
         stats = EpisodeStats(key, begun, instructions=[text], reset_ms=reset_ms)
         episodes.append(_Episode(i, session, stats, observer, executor, obs))
     watch("policy reset", 0)
-    _reset_policy(agent, episodes, contract, settings.policy_options)
+    _reset_policy(agent, episodes, contract, policy_options or {})
     steps, playing = 0, _unfinished(episodes)
     while playing:
         if requesting := [episode for episode in playing if not episode.ticks]:
@@ -211,7 +206,7 @@ def run_episodes(
             steps, playing = steps + 1, _unfinished(playing)
             if env.several_tasks and (begun_anew := _instructed(env, playing)):
                 watch("policy reset", steps)
-                _reset_policy(agent, begun_anew, contract, settings.policy_options)
+                _reset_policy(agent, begun_anew, contract, policy_options or {})
                 playing = _unfinished(playing)
     return [episode.outcome for episode in episodes if episode.outcome is not None]
 
