@@ -22,7 +22,6 @@ import zlib
 from collections.abc import Iterator, Mapping
 from contextlib import closing
 from dataclasses import dataclass
-from glob import escape
 from itertools import islice, zip_longest
 from pathlib import Path
 from typing import IO, Any, Literal
@@ -245,10 +244,7 @@ def _link_files(folder: Path, stage: Path, results: Results, *, videos: bool) ->
             if videos:
                 paths += one.videos
             if one.trajectory is not None:
-                paths.append(storage.require_below(one.trajectory))
-                numbers = folder / one.trajectory
-                seen = sorted(numbers.parent.glob(f"{escape(numbers.stem)}_*.mp4")) if videos else []
-                paths += [str(path.relative_to(folder)) for path in seen]
+                paths += [one.trajectory, *(storage.images_beside(folder, one.trajectory) if videos else ())]
     paths += [f"{storage.PROVENANCE}/{path.name}" for path in sorted((folder / storage.PROVENANCE).glob("*.diff"))]
     for path in dict.fromkeys(paths):
         source = storage.inside(folder, path)

@@ -10,7 +10,6 @@ from collections import Counter
 from collections.abc import Sequence
 from contextlib import closing
 from dataclasses import asdict, dataclass, field, replace
-from glob import escape
 from pathlib import Path
 from typing import Any
 
@@ -211,11 +210,9 @@ def _link_files(merged: _Merged, out: Path, folders: Sequence[Path]) -> None:
     sources: dict[Path, Path] = {}
     for key, row in merged.episodes.items():
         home = merged.home[key]
-        paths = [storage.require_below(path) for path in json.loads(row["videos"])]
+        paths: list[str] = json.loads(row["videos"])
         if row["trajectory"] is not None:
-            numbers = home / storage.require_below(row["trajectory"])
-            seen = sorted(numbers.parent.glob(f"{escape(numbers.stem)}_*.mp4"))
-            paths += [str(path.relative_to(home)) for path in (*seen, numbers)]
+            paths += [*storage.images_beside(home, row["trajectory"]), row["trajectory"]]
         for path in paths:
             sources[out / path] = storage.require_there(storage.inside(home, path))
     for folder in folders:

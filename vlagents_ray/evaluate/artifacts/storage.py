@@ -10,6 +10,7 @@ import sqlite3
 import tempfile
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
+from glob import escape
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path, PurePosixPath
 from typing import Any
@@ -72,6 +73,12 @@ def inside(home: Path, path: str) -> Path:
             f"into the folder in its place"
         )
     return found
+
+
+def images_beside(home: Path, trajectory: str) -> list[str]:
+    """Return the MP4s of the policy's images beside a trajectory in the folder of results `home`, relative to it."""
+    numbers = home / require_below(trajectory)
+    return [str(path.relative_to(home)) for path in sorted(numbers.parent.glob(f"{escape(numbers.stem)}_*.mp4"))]
 
 
 def require_there(path: Path) -> Path:
