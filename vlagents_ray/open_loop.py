@@ -238,8 +238,7 @@ class RecordedDataset:
 
 
 def _values(text: str) -> dict[str, Any]:
-    found: dict[str, Any] = from_text(text, Budget(DEFAULT_LIMITS)) if text else {}
-    return found
+    return dict(from_text(text, Budget(DEFAULT_LIMITS))) if text else {}
 
 
 Sessions = Callable[[], Agent]  # opens a session; the caller closes it
