@@ -30,14 +30,14 @@ from vlagents_ray.naming import distinct, plain
 DEFAULT_FPS = 20.0  # for an env whose contract has no control rate
 
 
-class VideoRecorder:
+class VideoRecorder(EpisodeObserver):
     """Videos of one episode, one for each camera. `close` frees the encoders."""
 
     def __init__(self, fps: float | None = None) -> None:
         self._fps = fps or DEFAULT_FPS
         self._tracks: dict[str, tuple[io.BytesIO, Mp4]] = {}  # by camera
 
-    def add(self, obs: Obs) -> None:
+    def add_observation(self, obs: Obs) -> None:
         """Append every camera's image, (H, W, 3) uint8 RGB."""
         for name, image in obs.cameras.items():
             if name not in self._tracks:
@@ -237,7 +237,8 @@ class Recording(EpisodeRecorder):
         self._wants_video, self._wants_trajectory = config.video, config.record
         self._video = VideoRecorder(fps)
         self._trajectory, self._played = TrajectoryRecorder(), PlayedEpisode()
-        self._observers: list[EpisodeObserver] = [self._played] if self.wants_images == "failures" else []
+        self._observers: list[EpisodeObserver] = [self._video] if self.wants_images != "none" else []
+        self._observers += [self._played] if self.wants_images == "failures" else []
         self._observers += [self._trajectory] if self._wants_trajectory != "none" else []
 
     @property
@@ -246,7 +247,6 @@ class Recording(EpisodeRecorder):
         return "all" if "all" in wanted else "failures" if "failures" in wanted else "none"
 
     def add_observation(self, obs: Obs) -> None:
-        self._show(obs)
         for observer in self._observers:
             observer.add_observation(obs)
 
@@ -264,15 +264,11 @@ class Recording(EpisodeRecorder):
             return Artifacts()
         if self._played.lacks_images:
             self._video.close()
-            if (reason := second_pass(self._played, self._show)) is not None:
+            if (reason := second_pass(self._played, self._video.add_observation)) is not None:
                 return Artifacts(not_repeatable=reason)
         videos = self._video.finish()
         numbers = self._trajectory.finish().to_bytes() if trajectory else None
         return Artifacts(videos if video else {}, videos if trajectory else {}, numbers)
-
-    def _show(self, obs: Obs) -> None:
-        if self._wants_video != "none" or self._wants_trajectory != "none":
-            self._video.add(obs)
 
     def close(self) -> None:
         self._video.close()

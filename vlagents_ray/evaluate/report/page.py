@@ -49,8 +49,7 @@ class Figure(NamedTuple):
     note: str
 
 
-@dataclass(frozen=True, slots=True)
-class Section:
+class Section(NamedTuple):
     """A part of the page with a heading in the table of contents."""
 
     title: str
@@ -182,7 +181,6 @@ def latency(summary: Summary) -> Latency | None:
     return Latency(chart, stages, rows, summary.transports, len(timed))
 
 
-PROTOCOL = "protocol"  # key of an env's description: the constants of its benchmark
 _SETTINGS = ("env_options", "reset_options", "clock")
 
 
@@ -237,7 +235,7 @@ def protocol(results: Results) -> list[Env]:
     envs = []
     for cell, tasks in alike.values():
         described = dict(cell.described)
-        constants = described.pop(PROTOCOL, None)
+        constants = described.pop("protocol", None)
         of_benchmark = constants if isinstance(constants, Mapping) else None
         settings = {name: value for name in _SETTINGS if (value := cell.settings.get(name))}
         contract = _yaml(cell.contract) if cell.contract else None
