@@ -123,7 +123,8 @@ THROUGHPUT = TuningGoal("throughput")
 
 
 def point(variant: Variant, sessions: int, rate: float, p99: float = 50.0) -> MeasuredPoint:
-    return MeasuredPoint(variant, sessions, rate, p99 / 2, p99, 100.0, 0.001)
+    trips_ms = [p99 / 2] * 3 + [p99] * 2
+    return MeasuredPoint(variant, sessions, 0.001, [rate], trips_ms, 100.0)
 
 
 def test_for_throughput_the_largest_rate_is_chosen() -> None:
