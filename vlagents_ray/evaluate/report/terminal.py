@@ -164,9 +164,7 @@ class LiveProgress(_CountedProgress):
         self._live.stop()  # the last state stays on the terminal
 
     def _drawing(self) -> Rows:
-        table = Table(box=None)
-        for title in ("env", "episodes", "success so far"):
-            table.add_column(title)
+        table = Table("env", "episodes", "success so far", box=None)
         for row in self._rows():
             table.add_row(*row)
         return Rows(table, Text(self._overall()))

@@ -272,7 +272,15 @@ class PageOperator(Operator):
         listening = socket.create_server(("127.0.0.1", self._port))
         token = secrets.token_urlsafe(24)
         self.url = f"http://127.0.0.1:{listening.getsockname()[1]}/{token}/"
-        app = Starlette(routes=[Mount(f"/{token}", routes=self._routes())])
+        routes = [
+            Route("/", self._file),
+            Route("/{name:str}", self._file),
+            Route("/now/state", self._state),
+            Route("/now/camera/{name:path}", self._camera),
+            Route("/start/{name:path}", self._start),
+            Route("/now/answer", self._take, methods=["POST"]),
+        ]
+        app = Starlette(routes=[Mount(f"/{token}", routes=routes)])
         settings = uvicorn.Config(app, log_config=None, access_log=False, lifespan="off", ws="none")
         self._server = uvicorn.Server(settings)
         self._thread = threading.Thread(
@@ -328,16 +336,6 @@ class PageOperator(Operator):
 
     def _is_watched(self) -> bool:
         return time.monotonic() - self._asked_at < _AWAY_S
-
-    def _routes(self) -> list[Route]:
-        return [
-            Route("/", self._file),
-            Route("/{name:str}", self._file),
-            Route("/now/state", self._state),
-            Route("/now/camera/{name:path}", self._camera),
-            Route("/start/{name:path}", self._start),
-            Route("/now/answer", self._take, methods=["POST"]),
-        ]
 
     async def _file(self, http: Request) -> Response:
         name = http.path_params.get("name", "operator.html")
