@@ -49,7 +49,6 @@ class WandbRun:
     """
 
     def __init__(self, about: About) -> None:
-        """Begin the run, or resume it."""
         self._wandb: Any = require("wandb")
         self._id = about.id
         # Code is in the config and in an artifact, as wandb would only read the driver's folder.

@@ -173,7 +173,6 @@ class EngineTarget:
     """
 
     def __init__(self, engine: Engine) -> None:
-        """Push to that engine alone."""
         self._engine = engine
 
     def push(self, named: Mapping[str, Any], options: PushOptions) -> int:

@@ -41,7 +41,6 @@ class TransitionRecorder(EpisodeRecorder):
     def __init__(
         self, _config: EvalConfig, _hz: float | None, *, want: Sequence[str] = (), images: bool = True
     ) -> None:
-        """Begin an episode."""
         self._pa: Any = require("pyarrow", extra=EXTRA)
         self._want, self._images = tuple(want), images
         self.request_info: Mapping[str, Any] = {WANT: list(want)} if want else {}

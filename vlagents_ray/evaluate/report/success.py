@@ -44,7 +44,6 @@ class LearningCurve:
 
 
 def success_table(summary: Summary) -> SuccessTable:
-    """Return the first table of the page."""
     total = summary.total
     parts = [part for name in summary.results.contenders for part in summary.parts(name).values()]
     return SuccessTable(
@@ -202,7 +201,6 @@ def compare_all(summary: Summary) -> Comparisons | None:
 
 
 def totals(found: Sequence[Comparison]) -> list[Difference]:
-    """Return the differences on all suites together."""
     return [_difference(one, one.total) for one in found]
 
 

@@ -100,7 +100,6 @@ def require_readable(out: Path, db: sqlite3.Connection) -> None:
 
 @functools.cache
 def _known_columns() -> dict[str, set[str]]:
-    """Return the columns of this version, by table."""
     with contextlib.closing(sqlite3.connect(":memory:")) as db:
         create(db)
         tables = [name for (name,) in db.execute("SELECT name FROM sqlite_master WHERE type = 'table'")]

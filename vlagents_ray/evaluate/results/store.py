@@ -70,7 +70,6 @@ class Store(AbstractContextManager["Store"]):
         self.close()
 
     def close(self) -> None:
-        """Close the file, and release the lock."""
         self._db.close()
         os.close(self._lock)
 
@@ -186,14 +185,12 @@ class Store(AbstractContextManager["Store"]):
         self._db.execute("UPDATE runs SET changes = ? WHERE run = ?", (value, self._run))
 
     def record_attempt(self, job: Job, failure: Failure, *, retried: bool) -> None:
-        """Record an attempt that failed by infrastructure."""
         where = (str(job.key), job.key.settings, job.attempt, self._run, time.time())
         why = (failure.cause, failure.code, failure.message, failure.traceback, failure.log, retried)
         with self._db:
             self._db.execute("INSERT INTO attempts VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?)", where + why)
 
     def note_worker(self, where: WorkerInfo) -> None:
-        """Record a worker that has connected to a policy or made an env."""
         with self._db:
             insert(self._db, "workers", asdict(where) | {"run": self._run, "at": time.time()})
 

@@ -107,7 +107,6 @@ class TrialLog(contextlib.AbstractContextManager["TrialLog"]):
         return {one.trial: one for one in self.attempts if one.finished}
 
     def of(self, trial: int) -> list[LoggedTrial]:
-        """Return the attempts at a trial, by its number."""
         return [one for one in self.attempts if one.trial == trial]
 
     def begin(self, trial: int, attempt: int) -> None:
