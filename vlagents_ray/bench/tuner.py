@@ -202,7 +202,7 @@ class Tuner:
         with tempfile.TemporaryDirectory() as folder:
             frames = None
             if self._plan.frames is not None:
-                frames = Path(folder) / "frames.npz"
+                frames = Path(folder) / "frames"
                 save_observations(recorded_observations(self._plan.frames, FRAMES), frames)
             ready = self._measure_own(frames)
             rates = {point.sessions: point.actions_per_s for point in self._points}
