@@ -253,20 +253,21 @@ def combined(folders: Sequence[Results]) -> Results:
         weights, checkpoint = stated(cell, "weights"), stated(cell, "checkpoint")
         if weights is not None and known.setdefault((cell.contender, checkpoint), weights) != weights:
             clashing.add(cell.policy)
-    base = Path(os.path.commonpath([each.out.resolve() for each in folders]))
+    homes = [each.out.resolve() for each in folders]
+    base = Path(os.path.commonpath(homes))
     cells: list[CellResults] = []
     runs: list[Run] = []
     policies: dict[str, dict[str, Any]] = {}
     workers: list[Worker] = []
     # The folders' last parts or, if some are the same, their paths under `base`.
-    labels = [each.out.resolve().name for each in folders]
+    labels = [home.name for home in homes]
     if len(set(labels)) < len(labels):
-        labels = [str(each.out.resolve().relative_to(base)) for each in folders]
-    for each, label in zip(folders, labels, strict=True):
+        labels = [str(home.relative_to(base)) for home in homes]
+    for each, home, label in zip(folders, homes, labels, strict=True):
         names = {
             cell.policy: f"{cell.policy} ({label})" if cell.policy in clashing else cell.policy for cell in each.cells
         }
-        prefix = each.out.resolve().relative_to(base)
+        prefix = home.relative_to(base)
         for cell in each.cells:
             episodes = tuple(
                 replace(one, run=one.run + len(runs), videos=tuple(str(prefix / video) for video in one.videos))
@@ -279,5 +280,5 @@ def combined(folders: Sequence[Results]) -> Results:
             replace(one, policy=names.get(one.policy, one.policy), run=one.run + len(runs)) for one in each.workers
         ]
         runs += [replace(run, run=run.run + len(runs)) for run in each.runs]
-    parts = tuple(sorted((each.out.resolve() for each in folders), reverse=True))  # subfolders before their parents
+    parts = tuple(sorted(homes, reverse=True))  # subfolders before their parents
     return Results(base, tuple(cells), tuple(runs), policies, tuple(workers), parts)
