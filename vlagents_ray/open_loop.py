@@ -112,14 +112,11 @@ class RecordedDataset:
             parts = [part for part in parts if part.index in set(chosen)]
         if not self.traced:
             return [RecordedSession((part,), {}) for part in parts]
-        sessions: dict[int, list[tuple[RecordedEpisode, dict[str, list[Any]]]]] = {}
+        sessions: dict[int, tuple[list[RecordedEpisode], str]] = {}  # with the options of the first reset
         for part in parts:
-            columns = self._rows(part, [SESSION, "tick", "reset"])
-            sessions.setdefault(columns[SESSION][0], []).append((part, columns))
-        return [
-            RecordedSession(tuple(part for part, _ in found), _values(found[0][1]["reset"][0]))
-            for found in sessions.values()
-        ]
+            columns = self._rows(part, [SESSION, "reset"])
+            sessions.setdefault(columns[SESSION][0], ([], columns["reset"][0]))[0].append(part)
+        return [RecordedSession(tuple(found), _values(reset)) for found, reset in sessions.values()]
 
     def gaps(self, part: RecordedEpisode) -> int:
         """Return the number of missing acts within a traced episode."""
@@ -240,14 +237,8 @@ class RecordedDataset:
         return found
 
 
-def find_datasets(folder: Path) -> list[Path]:
-    """Return the datasets in a folder, or the folder itself if it is a dataset."""
-    return [path.parents[1] for pattern in ("", "*/") for path in sorted(folder.glob(f"{pattern}meta/info.json"))]
-
-
 def _values(text: str) -> dict[str, Any]:
-    found: dict[str, Any] = from_text(text, Budget(DEFAULT_LIMITS)) if text else {}
-    return found
+    return dict(from_text(text, Budget(DEFAULT_LIMITS))) if text else {}
 
 
 Sessions = Callable[[], Agent]  # opens a session; the caller closes it
@@ -276,14 +267,14 @@ def candidate(source: str) -> Iterator[Sessions]:
 class ErrorTable:
     """Sums over the frames so far, for each step of the horizon (H) and each number of an action (D)."""
 
-    dim: int
+    joints: list[str]  # the names of these numbers
     absolute: np.ndarray = field(init=False)  # (H, D), of the absolute errors
     square: np.ndarray = field(init=False)  # (H, D), of the squared errors
     largest: np.ndarray = field(init=False)  # (H, D), largest absolute error
     frames: np.ndarray = field(init=False)  # (H,)
 
     def __post_init__(self) -> None:
-        self.absolute, self.square, self.largest = (np.zeros((0, self.dim)) for _ in range(3))
+        self.absolute, self.square, self.largest = (np.zeros((0, len(self.joints))) for _ in range(3))
         self.frames = np.zeros(0, np.int64)
 
     def add(self, expected: np.ndarray, got: np.ndarray) -> float:
@@ -301,7 +292,7 @@ class ErrorTable:
         self.frames[:rows] += 1
         return float(error.mean())
 
-    def to_json(self, joints: list[str]) -> dict[str, Any]:
+    def to_json(self) -> dict[str, Any]:
         """Return the errors overall, by joint, by step, and by both, in the units of the actions."""
         total = max(1, int(self.frames.sum()))
         mae, rms = self.absolute.sum(0) / total, np.sqrt(self.square.sum(0) / total)
@@ -314,7 +305,7 @@ class ErrorTable:
             "max": float(largest.max(initial=0)),
             "by_joint": [
                 {"joint": name, "mae": float(mae[i]), "rmse": float(rms[i]), "max": float(largest[i])}
-                for i, name in enumerate(joints)
+                for i, name in enumerate(self.joints)
             ],
             "by_step": [
                 {"step": step, "frames": int(frames), "mae": float(mean), "rmse": float(root)}
@@ -340,7 +331,6 @@ class OpenLoopResult:
     """The errors of one policy on some datasets."""
 
     datasets: list[str]
-    joints: list[str]
     against: str  # "answers" recorded by a server, or "actions" of the dataset
     table: ErrorTable
     sessions: int = 0
@@ -357,7 +347,7 @@ class OpenLoopResult:
             "sessions": self.sessions,
             "frames": len(self.frames),
             "missing_acts": self.missing,
-            **self.table.to_json(self.joints),
+            **self.table.to_json(),
             "by_episode": [
                 {"dataset": dataset, "episode": episode, "frames": len(errors), "mae": float(np.mean(errors))}
                 for (dataset, episode), errors in sorted(by_episode.items())
@@ -376,19 +366,16 @@ def replay(folder: Path, sessions: Sessions, plan: ReplayPlan) -> OpenLoopResult
         ConfigError: There is no dataset, its actions do not fit the policy's, or a name is unknown.
         PolicyFailed: The policy raised an error, or refused an observation.
     """
-    if not (datasets := [RecordedDataset(root) for root in find_datasets(folder)]):
+    found = [path for pattern in ("", "*/") for path in sorted(folder.glob(f"{pattern}meta/info.json"))]
+    if not (datasets := [RecordedDataset(path.parents[1]) for path in found]):
         raise ConfigError(f"{folder}: is no LeRobotDataset, and has none in it (meta/info.json)")
     first = datasets[0]
     for other in datasets[1:]:
         if len(other.joints) != len(first.joints) or other.traced != first.traced:
             raise ConfigError(f"{other.root}: has other actions than {first.root}; replay them one by one")
     plays = [play for dataset in datasets for play in dataset.plays(plan.episodes)]
-    result = OpenLoopResult(
-        [str(one.root) for one in datasets],
-        first.joints,
-        "answers" if first.traced else "actions",
-        ErrorTable(len(first.joints)),
-    )
+    against = "answers" if first.traced else "actions"
+    result = OpenLoopResult([str(one.root) for one in datasets], against, ErrorTable(first.joints))
     result.missing = sum(part.dataset.gaps(part) for play in plays for part in play.parts)
     lock = threading.Lock()
 

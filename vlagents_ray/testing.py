@@ -25,6 +25,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass, fields, is_dataclass, replace
+from itertools import cycle, islice
 from typing import Any
 
 import numpy as np
@@ -176,7 +177,8 @@ def check_agent(
         raise ContractViolation(f"contract: got {type(contract).__name__}, want a Contract or None")
     views = [obs] if isinstance(obs, Obs) else list(obs or ())
     views = views or [random_observation(contract, seed) for seed in range(_SESSIONS)]
-    suite = _AgentSuite(agent, contract, views, instructions, dict(reset_kwargs or {}))
+    views, texts = [*islice(cycle(views), _SESSIONS)], [*islice(cycle(instructions), _SESSIONS)]
+    suite = _AgentSuite(agent, contract, views, texts, dict(reset_kwargs or {}))
 
     alone = [suite.play_alone(i, steps) for i in range(_SESSIONS)]
     because = "the same observations, instruction and seed must give the same actions"
@@ -245,8 +247,8 @@ class _AgentSuite:
 
     _agent: Agent
     _contract: Contract | None
-    _views: list[Obs]
-    _instructions: Sequence[str]
+    _views: list[Obs]  # of each session
+    _instructions: list[str]  # of each session
     _reset_kwargs: dict[str, Any]
     cure: str = (  # of errors that the agent raises
         "if the policy parses its instructions or takes only some observations, give "
@@ -263,10 +265,10 @@ class _AgentSuite:
                 f"the initialized agent cannot be copied for a session: {error}; "
                 f"name the attributes that sessions may share in `shared`"
             ) from error
-        obs = self._view(i)
+        obs = self._views[i]
         before = copy.deepcopy(obs)
         with self._calling("reset", i):
-            info = session.reset(obs, self._instruction(i), seed=i, **self._reset_kwargs)
+            info = session.reset(obs, self._instructions[i], seed=i, **self._reset_kwargs)
         require_same(before, obs, "the observation", "reset changed the caller's: work on a copy")
         if not isinstance(info, dict):
             raise ContractViolation(f"reset: got {type(info).__name__}, want a dict")
@@ -282,7 +284,7 @@ class _AgentSuite:
         return kept
 
     def act(self, i: int, session: Agent, *, prepared: bool = False) -> Act:
-        obs = self._view(i)
+        obs = self._views[i]
         before = copy.deepcopy(obs)
         if prepared:
             obs = replace(obs, prepared=self.prepare(i, session))
@@ -293,10 +295,10 @@ class _AgentSuite:
 
     def prepare(self, i: int, session: Agent) -> Any:
         with self._calling("prepare", i):
-            return session.prepare(self._view(i))
+            return session.prepare(self._views[i])
 
     def act_batch(self, sessions: list[Agent]) -> list[Act]:
-        views = [self._view(i) for i in range(len(sessions))]
+        views = self._views[: len(sessions)]
         before = copy.deepcopy(views)
         acts = self._agent.act_batch(views, sessions)
         require_same(before, views, "the observations", "act_batch changed the caller's: work on copies")
@@ -310,16 +312,10 @@ class _AgentSuite:
         try:
             yield
         except Exception as error:
-            got = f"{method}: raised {error!r} for the instruction {self._instruction(i)!r}"
+            got = f"{method}: raised {error!r} for the instruction {self._instructions[i]!r}"
             if method != "reset":
                 got += f" and the observation of session {i}"
             raise ContractViolation(f"{got}, want no error; {self.cure}") from error
-
-    def _instruction(self, i: int) -> str:
-        return self._instructions[i % len(self._instructions)]
-
-    def _view(self, i: int) -> Obs:
-        return self._views[i % len(self._views)]
 
     def _checked(self, act: object, where: str) -> Act:
         if isinstance(act, Exception):

@@ -64,8 +64,8 @@ def test_a_file_brings_them_to_another_process(tmp_path: Path) -> None:
     record(tmp_path / "ep0.npz", 0.0)
     observations = recorded_observations(tmp_path, 3)
     observations[1].gripper = None
-    save_observations(observations, tmp_path / "frames.npz")
-    loaded = load_observations(tmp_path / "frames.npz")
+    save_observations(observations, tmp_path / "frames")
+    loaded = load_observations(tmp_path / "frames")
     assert len(loaded) == 3
     for one, other in zip(loaded, observations, strict=True):
         assert one.gripper == other.gripper
@@ -123,7 +123,8 @@ THROUGHPUT = TuningGoal("throughput")
 
 
 def point(variant: Variant, sessions: int, rate: float, p99: float = 50.0) -> MeasuredPoint:
-    return MeasuredPoint(variant, sessions, rate, p99 / 2, p99, 100.0, 0.001)
+    trips_ms = [p99 / 2] * 3 + [p99] * 2
+    return MeasuredPoint(variant, sessions, 0.001, [rate], trips_ms, 100.0)
 
 
 def test_for_throughput_the_largest_rate_is_chosen() -> None:

@@ -194,9 +194,9 @@ def test_spaces_are_those_of_the_contract() -> None:
 
 def test_a_size_that_the_contract_leaves_open_is_an_error_that_names_it() -> None:
     with pytest.raises(ConfigError, match="front: height: the env's contract does not state it"):
-        observation_space(gymnasium.spaces, Contract(cameras={"front": CameraSpec()}), "all")
+        observation_space(Contract(cameras={"front": CameraSpec()}), "all")
     with pytest.raises(ConfigError, match="got 'state', but the env's contract has none"):
-        observation_space(gymnasium.spaces, Contract(), "state")
+        observation_space(Contract(), "state")
 
 
 @pytest.mark.parametrize(

@@ -10,7 +10,7 @@ import numpy as np
 from vlagents_ray.envs import EvalEnv
 from vlagents_ray.envs.base import SequentialBatch
 from vlagents_ray.errors import VLAgentsError
-from vlagents_ray.evaluate.episode.episode import EpisodeSettings, run_episodes
+from vlagents_ray.evaluate.episode.episode import run_episodes
 from vlagents_ray.evaluate.episode.records import EpisodeObserver, EpisodeResult
 from vlagents_ray.evaluate.plan.jobs import EpisodeKey
 from vlagents_ray.interface import Act, Agent, Obs
@@ -43,9 +43,7 @@ def run_episode(
     """
     observer, batch = EpisodeObserver(), SequentialBatch([env])
     observer.add_action = executed  # type: ignore[method-assign]
-    [outcome] = run_episodes(
-        batch, agent, [agent], [key], EpisodeSettings(**settings), observers=[observer], images=images
-    )
+    [outcome] = run_episodes(batch, agent, [agent], [key], **settings, observers=[observer], images=images)
     if isinstance(outcome, VLAgentsError):
         raise outcome
     return outcome

@@ -97,5 +97,5 @@ def _trouble(store: Store, job: Job, *, lost: bool) -> None:
 def _video() -> dict[str, bytes]:
     with closing(VideoRecorder(10.0)) as recorder:
         for shade in range(0, 250, 50):
-            recorder.add(Obs(cameras={"front": np.full((32, 48, 3), shade, np.uint8)}))
+            recorder.add_observation(Obs(cameras={"front": np.full((32, 48, 3), shade, np.uint8)}))
         return recorder.finish()

@@ -14,7 +14,7 @@ import resource
 import sys
 import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -25,7 +25,8 @@ from vlagents_ray.contract import Contract
 from vlagents_ray.errors import PolicyFailed
 from vlagents_ray.interface import Act, Agent, Obs
 from vlagents_ray.policies.wrapper import Wrapper, build_agent
-from vlagents_ray.protocol.messages import RankName, Reply, Request
+from vlagents_ray.protocol.frames import decode_requests, encode_requests
+from vlagents_ray.protocol.messages import DEFAULT_LIMITS, Budget, RankName, Reply, Request
 from vlagents_ray.serve.engine.engine import Engine
 from vlagents_ray.serve.models.agent_copies import AgentCopies
 from vlagents_ray.serve.python_env.child_start import die_with_parent, own_stdout
@@ -36,7 +37,6 @@ from vlagents_ray.validation import check_observation
 INSTRUCTION = "pick up the cube"
 WARM = 2  # warm-up batches, which do not count
 _LATE_S = 600.0  # a first batch may be compiled
-_CAMERA, _STATE, _GRIPPER = "camera", "state", "gripper"  # keys: NUMBER/camera/NAME, NUMBER/state/NAME, NUMBER/gripper
 FRAMES = 8  # episodes whose first actions are compared
 _TUNED = ("compile", "dtype", "quantization", "batch_sizes")  # settings of a policy
 
@@ -225,28 +225,17 @@ class ProcessSettings:
 
 
 def save_observations(observations: Sequence[Obs], file: Path) -> None:
-    """Write observations as an .npz, for `load_observations`."""
-    arrays: dict[str, np.ndarray] = {}
-    for number, obs in enumerate(observations):
-        arrays |= {f"{number}/{_CAMERA}/{name}": image for name, image in obs.cameras.items()}
-        arrays |= {f"{number}/{_STATE}/{name}": values for name, values in obs.state.items()}
-        if obs.gripper is not None:
-            arrays[f"{number}/{_GRIPPER}"] = np.array(obs.gripper)
-    np.savez(file, **arrays)  # type: ignore[arg-type]
+    """Write observations as a frame of requests, for `load_observations`."""
+    file.write_bytes(encode_requests([Request("act", obs) for obs in observations]))
 
 
 def load_observations(file: Path) -> list[Obs]:
     """Read the observations written by `save_observations`."""
-    found: dict[int, Obs] = {}
-    with np.load(file, allow_pickle=False) as arrays:
-        for key in arrays.files:
-            number, kind, *name = key.split("/", 2)
-            obs = found.setdefault(int(number), Obs())
-            if kind == _GRIPPER:
-                obs.gripper = float(arrays[key])
-            else:
-                (obs.cameras if kind == _CAMERA else obs.state)[name[0]] = arrays[key]
-    return [found[number] for number in sorted(found)]
+    data = file.read_bytes()
+    requests, refused = decode_requests(data, Budget(replace(DEFAULT_LIMITS, body_bytes=len(data))))
+    for reply in refused.values():
+        raise PolicyFailed(f"{file}: an observation cannot be sent to a server") from reply.error
+    return [request.obs for request in requests if request.obs is not None]
 
 
 def main() -> None:

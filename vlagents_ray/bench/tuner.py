@@ -59,17 +59,37 @@ class Variant:
         return ", ".join(words) or "own settings"
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(slots=True)
 class MeasuredPoint:
-    """The figures of one variant and one number of sessions, which equals its batch size."""
+    """A variant with one number of sessions, which equals its batch size, measured in alternation with others."""
 
     variant: Variant
     sessions: int
-    actions_per_s: float
-    round_trip_ms: float  # the median
-    p99_ms: float
-    peak_mib: float
     difference: float  # largest difference from the actions of the file's own settings, as a share of their range
+    rates: list[float] = field(default_factory=list)  # actions per second, for each turn
+    trips_ms: list[float] = field(default_factory=list)  # of all turns
+    peak_mib: float = 0.0
+    took_s: float = 0.0  # of the first turn
+
+    def add(self, turn: Mapping[str, Any]) -> None:
+        self.rates.append(turn["actions_per_s"])
+        self.trips_ms += turn["trips_ms"]
+        self.peak_mib = max(self.peak_mib, turn["peak_mib"])
+
+    @property
+    def actions_per_s(self) -> float:
+        """The median rate of the turns."""
+        return statistics.median(self.rates)
+
+    @property
+    def round_trip_ms(self) -> float:
+        """The median of all round trips."""
+        return float(np.median(self.trips_ms))
+
+    @property
+    def p99_ms(self) -> float:
+        """The 99th percentile of all round trips."""
+        return float(np.quantile(self.trips_ms, 0.99))
 
     def reaches(self, goal: TuningGoal) -> bool:
         """Return whether round trips are short enough for robots, if that is the goal."""
@@ -162,32 +182,6 @@ class TunePlan:
     dims: Mapping[str, int] = field(default_factory=dict)  # sizes of parts of the state that the contract leaves open
 
 
-@dataclass(slots=True)
-class TunedSize:
-    """A variant with one number of sessions, measured in alternation with others."""
-
-    variant: Variant
-    sessions: int
-    difference: float
-    rates: list[float] = field(default_factory=list)  # actions per second, for each turn
-    trips_ms: list[float] = field(default_factory=list)
-    peak_mib: float = 0.0
-    took_s: float = 0.0  # of the first turn
-
-    def add(self, turn: Mapping[str, Any]) -> None:
-        self.rates.append(turn["actions_per_s"])
-        self.trips_ms += turn["trips_ms"]
-        self.peak_mib = max(self.peak_mib, turn["peak_mib"])
-
-    def point(self) -> MeasuredPoint:
-        """Return the median rate of the turns, and the quantiles of all round trips."""
-        median, p99 = np.quantile(self.trips_ms, [0.5, 0.99])
-        rate = statistics.median(self.rates)
-        return MeasuredPoint(
-            self.variant, self.sessions, rate, float(median), float(p99), self.peak_mib, self.difference
-        )  # fmt: skip
-
-
 class Tuner:
     """Measures the plan; `left_out` has a sentence for each skipped variant."""
 
@@ -200,7 +194,7 @@ class Tuner:
         self._plan, self._progress = plan, progress
         self._end = (time.monotonic() if began is None else began) + plan.minutes * 60
         self._wanted: list[np.ndarray] = []  # actions of the file's own settings
-        self._sizes: list[TunedSize] = []
+        self._points: list[MeasuredPoint] = []
         self._failed: list[Variant] = []
 
     def measure(self) -> list[MeasuredPoint]:
@@ -208,10 +202,10 @@ class Tuner:
         with tempfile.TemporaryDirectory() as folder:
             frames = None
             if self._plan.frames is not None:
-                frames = Path(folder) / "frames.npz"
+                frames = Path(folder) / "frames"
                 save_observations(recorded_observations(self._plan.frames, FRAMES), frames)
             ready = self._measure_own(frames)
-            rates = {size.sessions: statistics.median(size.rates) for size in self._sizes}
+            rates = {point.sessions: point.actions_per_s for point in self._points}
             most = max(rates, key=rates.__getitem__) if self._plan.goal.kind == "throughput" else max(rates)
             variants = self._variants(ready, sorted(size for size in rates if size <= most))
             for number, variant in enumerate(variants):
@@ -231,7 +225,7 @@ class Tuner:
                 except VariantFailed as error:
                     self._failed.append(variant)
                     self.left_out.append(f"{variant.name}: {error}")
-        return [size.point() for size in self._sizes]
+        return self._points
 
     def _measure_own(self, frames: Path | None) -> Mapping[str, Any]:
         """Measure the file's own settings; return the report of their process."""
@@ -245,7 +239,7 @@ class Tuner:
                 self._wanted = self._actions(process, sizes[0])[:FRAMES]
                 self._sweep(process, own, sizes, parts=len(self._variants(ready, ())) + 1)
         except VariantFailed as error:
-            if ready is None or not self._sizes:
+            if ready is None or not self._points:
                 raise VariantFailed(f"the file's own settings: {error}") from error
             self.left_out.append(f"{own.name}: {error}")
         return ready
@@ -301,7 +295,7 @@ class Tuner:
         """Measure a loaded variant with growing batches while the rate rises, then again in turns as time permits."""
         now = time.monotonic()
         until = now + (self._end - now) / parts
-        found: list[TunedSize] = []
+        found: list[MeasuredPoint] = []
         for size in sizes:
             if not self._worth_more(found) or not self._add(process, variant, size, found, until):
                 break
@@ -315,14 +309,14 @@ class Tuner:
             for measured in found:
                 measured.add(self._turn(process, measured.sessions))
 
-    def _worth_more(self, found: Sequence[TunedSize]) -> bool:
+    def _worth_more(self, found: Sequence[MeasuredPoint]) -> bool:
         """Return whether a larger batch may serve the goal better than the measured ones, ascending."""
         if found and self._plan.goal.p99_ms is not None:
-            return found[-1].point().round_trip_ms <= self._plan.goal.p99_ms
+            return found[-1].round_trip_ms <= self._plan.goal.p99_ms
         rates = [measured.rates[0] for measured in found]
         return len(rates) < 3 or max(rates[-2:]) >= _RISING * max(rates[:-2])  # one measurement may have been disturbed
 
-    def _add(self, process: LineProcess, variant: Variant, size: int, found: list[TunedSize], until: float) -> bool:
+    def _add(self, process: LineProcess, variant: Variant, size: int, found: list[MeasuredPoint], until: float) -> bool:
         """Compare the actions of a batch size, and measure it once; return False, with a report, if it is skipped."""
         began = time.monotonic()
         if found and began + found[-1].took_s * size / found[-1].sessions > until:
@@ -338,7 +332,7 @@ class Tuner:
                     f"{off}, for the same observations and seeds, so that nothing can be compared with them; let the "
                     f"seed of `reset` determine what is random in the policy, or raise --tolerance"
                 )
-            measured = TunedSize(variant, size, difference)
+            measured = MeasuredPoint(variant, size, difference)
             measured.add(self._turn(process, size))
         except VariantFailed as error:
             if not found:
@@ -347,7 +341,7 @@ class Tuner:
             return False
         measured.took_s = time.monotonic() - began
         found.append(measured)
-        self._sizes.append(measured)
+        self._points.append(measured)
         self._progress(f"{variant.name}, {sessions(size)}: {measured.rates[0]:.1f} actions/s")
         return True
 

@@ -13,6 +13,7 @@ import json
 import math
 import os
 import re
+import shutil
 import sqlite3
 import stat
 import tempfile
@@ -20,8 +21,7 @@ import zipfile
 import zlib
 from collections.abc import Iterator, Mapping
 from contextlib import closing
-from dataclasses import dataclass, field
-from glob import escape
+from dataclasses import dataclass
 from itertools import islice, zip_longest
 from pathlib import Path
 from typing import IO, Any, Literal
@@ -106,8 +106,7 @@ def pack(folder: Path, archive: Path) -> str:
         for name, path in names.items():
             how = zipfile.ZIP_STORED if path.suffix in (".mp4", ".npz") else zipfile.ZIP_DEFLATED  # already compressed
             with path.open("rb") as source, file.open(_member(name, how), "w", force_zip64=True) as target:
-                while chunk := source.read(_CHUNK):
-                    target.write(chunk)
+                shutil.copyfileobj(source, target, _CHUNK)
     return hashlib.sha256(text).hexdigest()
 
 
@@ -245,10 +244,7 @@ def _link_files(folder: Path, stage: Path, results: Results, *, videos: bool) ->
             if videos:
                 paths += one.videos
             if one.trajectory is not None:
-                paths.append(storage.require_below(one.trajectory))
-                numbers = folder / one.trajectory
-                seen = sorted(numbers.parent.glob(f"{escape(numbers.stem)}_*.mp4")) if videos else []
-                paths += [str(path.relative_to(folder)) for path in seen]
+                paths += [one.trajectory, *(storage.images_beside(folder, one.trajectory) if videos else ())]
     paths += [f"{storage.PROVENANCE}/{path.name}" for path in sorted((folder / storage.PROVENANCE).glob("*.diff"))]
     for path in dict.fromkeys(paths):
         source = storage.inside(folder, path)
@@ -261,7 +257,6 @@ MOST_TRAJECTORY = 2**30  # bytes of one, unpacked
 _TOLERANCE = 1e-9  # relative: sums of floating-point numbers may differ in their last bits
 _SHOWN = 3  # differences in a finding
 _LENGTH = 80  # characters of a value in a finding
-_SOFTWARE = ("python", "platform", "vlagents-ray", "ray", "numpy", "av")  # keys of `versions`
 
 
 @dataclass(frozen=True, slots=True)
@@ -449,7 +444,8 @@ def _finding(subject: str, odd: list[str], fine: str) -> Finding:
 def _check_versions(results: Results) -> Finding:
     """Compare the software of the last run with that here."""
     there, here = results.runs[-1].versions, storage.versions()
-    stated = {name: (there.get(name), here[name]) for name in _SOFTWARE} | {"commit": (_commit(there), _commit(here))}
+    stated = {name: (there.get(name), version) for name, version in here.items() if name != "code"}
+    stated |= {"commit": (_commit(there), _commit(here))}
     odd = [f"{name} {was} there, {now} here" for name, (was, now) in stated.items() if was != now]
     if odd:
         return Finding("versions", "other here", "; ".join(odd))
@@ -468,41 +464,36 @@ _CODE = re.compile("trust.*|module|source_dir")  # options that choose code, alt
 _WORD = re.compile(r"\w[\w.+-]{0,63}")  # a value that is text, and no path, URL or "module:Class"
 
 
-@dataclass(slots=True)
+@dataclass(frozen=True, slots=True)
 class Replayed:
     """The recorded actions in an environment here, compared with the recording step by step."""
 
-    recorded: Trajectory
-    success: list[bool] = field(default_factory=list)  # after each step
-    differs_from: int | None = None  # first step with another state, reward or success; 0 is the reset
-    largest: float = 0.0  # difference of a number of the state or of a reward
-    described: Mapping[str, Any] = field(default_factory=dict)  # by the environment here
+    success: list[bool]  # after each step
+    differences: dict[int, float]  # by the step that differs, 0 is the reset: the largest of a number
+    described: Mapping[str, Any]  # by the environment here
 
-    def add(self, number: int, obs: Obs, step: EnvStep | None) -> None:
-        """Compare an observation, and the other outputs of its step, of which the reset has none."""
-        now = {part: np.asarray(values, np.float32) for part, values in obs.state.items()}
-        if now.keys() != self.recorded.state.keys() or (obs.gripper is None) != (self.recorded.gripper is None):
-            self._differ(number, float("inf"))
-        else:
-            for part, values in now.items():
-                self._compare(number, self.recorded.state[part][number], values)
-            if self.recorded.gripper is not None:
-                self._compare(number, self.recorded.gripper[number], np.asarray(obs.gripper, np.float32))
-        if step is not None:
-            self.success.append(step.success)
-            self._compare(number, self.recorded.rewards[number - 1], np.float64(step.reward))
-            if bool(self.recorded.success[number - 1]) != step.success:
-                self._differ(number, 0.0)
 
-    def _compare(self, number: int, before: Any, now: Any) -> None:
-        if before.shape != now.shape:
-            self._differ(number, float("inf"))
-        elif before.tobytes() != now.tobytes():
-            self._differ(number, float(np.max(np.abs(np.asarray(before, np.float64) - np.asarray(now, np.float64)))))
+def _difference(recorded: Trajectory, number: int, obs: Obs, step: EnvStep | None) -> float | None:
+    """Return the largest difference of a step's numbers, or of those of the reset; None if they are equal to the bit.
 
-    def _differ(self, number: int, by: float) -> None:
-        self.differs_from = number if self.differs_from is None else self.differs_from
-        self.largest = max(self.largest, by)
+    It is infinite if there are other numbers, and 0 if only the success differs.
+    """
+    if obs.state.keys() != recorded.state.keys() or (obs.gripper is None) != (recorded.gripper is None):
+        return float("inf")
+    pairs = [(recorded.state[part][number], np.asarray(values, np.float32)) for part, values in obs.state.items()]
+    if recorded.gripper is not None:
+        pairs.append((recorded.gripper[number], np.asarray(obs.gripper, np.float32)))
+    if step is not None:
+        pairs.append((recorded.rewards[number - 1], np.asarray(step.reward, np.float64)))
+    odd = []
+    for then, now in pairs:
+        if then.shape != now.shape:
+            odd.append(float("inf"))
+        elif then.tobytes() != now.tobytes():
+            odd.append(float(np.max(np.abs(np.asarray(then, np.float64) - np.asarray(now, np.float64)))))
+    if step is not None and bool(recorded.success[number - 1]) != step.success:
+        odd.append(0.0)
+    return max(odd, default=None)
 
 
 def require_harmless(cell: CellResults) -> None:
@@ -536,12 +527,14 @@ def replay_actions(cell: CellResults, episode: Episode, trajectory: Trajectory) 
     try:
         with env_side("reset"):
             begin = options_of_reset(env, key.episode, cell.settings.get("reset_options"))
-        played = Replayed(trajectory)
+        success: list[bool] = []
+        differences: dict[int, float] = {}
         for number, (obs, step) in enumerate(play_actions(env, key.seed, begin, trajectory.actions, images=False)):
-            played.add(number, obs, step)
+            if (largest := _difference(trajectory, number, obs, step)) is not None:
+                differences[number] = largest
+            success += [] if step is None else [step.success]
         with env_side("describe"):
-            played.described = env.describe()
-        return played
+            return Replayed(success, differences, env.describe())
     finally:
         with env_side("close"):
             env.close()
@@ -566,13 +559,13 @@ def _replay(cell: CellResults, episode: Episode, trajectory: Trajectory, *, trus
     except VLAgentsError as error:
         return Finding(subject, "not checked", str(error))
     result, outcome, steps = episode.result, _outcome(played.success), len(played.success)
-    differs = f"the numbers differ from step {played.differs_from} of {steps} on, by at most {played.largest:.3g}"
+    first, largest = min(played.differences, default=None), max(played.differences.values(), default=0.0)
+    differs = f"the numbers differ from step {first} of {steps} on, by at most {largest:.3g}"
     if outcome != (result.success_once, result.success_at_end, result.first_success):
         now, then = ("solved" if solved else "not solved" for solved in (outcome[0], result.success_once))
         return Finding(subject, "differs", f"{now} here, {then} there; {differs}")
-    same = played.differs_from is None
     detail = f"{steps} actions, every state, reward and success to the bit"
-    if not same:
+    if first is not None:
         detail = f"the same outcome, other numbers; {differs}"
     there, here = cell.described, played.described
     odd = [
@@ -582,4 +575,4 @@ def _replay(cell: CellResults, episode: Episode, trajectory: Trajectory, *, trus
     ]
     if odd:
         detail += f"; the environment says of itself here: {'; '.join(odd)}"
-    return Finding(subject, "equal" if same else "other here", detail)
+    return Finding(subject, "equal" if first is None else "other here", detail)

@@ -15,7 +15,6 @@ from vlagents_ray.policies.base.checkpoint import STEP, at_step
 from vlagents_ray.policies.base.checkpoint_files import unfinished
 
 FINISHED = "training_finished"  # a file of this name in the folder means that no checkpoint follows
-PADDED = 6  # digits to which a step may be padded with zeros, as `find_checkpoint` accepts it
 
 Snapshot = frozenset[tuple[str, int, int]]  # (path, size in bytes, time of change in ns) of each file
 
@@ -84,7 +83,7 @@ class CheckpointWatcher:
         for entry in self.folder.iterdir() if self.folder.is_dir() else ():
             match = self._name.fullmatch(entry.name)
             step = int(match[1]) if match else -1
-            if match is None or match[1] not in (str(step), f"{step:0{PADDED}d}"):
+            if match is None or match[1] not in (str(step), f"{step:06d}"):  # as `find_checkpoint` accepts it
                 continue
             if step not in found or match[1] == str(step):  # the policy looks for this name first
                 found[step] = entry, entry.joinpath(*(at_step(part, match[1]) for part in self._below))

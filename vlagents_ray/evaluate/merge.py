@@ -10,7 +10,6 @@ from collections import Counter
 from collections.abc import Sequence
 from contextlib import closing
 from dataclasses import asdict, dataclass, field, replace
-from glob import escape
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +19,7 @@ from vlagents_ray.evaluate.plan.config import canonical
 from vlagents_ray.evaluate.report.page import FILE as REPORT
 from vlagents_ray.evaluate.report.page import write_report
 from vlagents_ray.evaluate.results.changes import Change, changed, listed, policy_changes, program_changes
-from vlagents_ray.evaluate.results.database import FILE, SCHEMA, VERSION, insert
+from vlagents_ray.evaluate.results.database import FILE, create, insert
 from vlagents_ray.evaluate.results.reader import CellResults, Results, Run, Worker, episode_of, reading, table
 from vlagents_ray.evaluate.results.summary import Summary, stated, summarize, write_summary
 
@@ -97,7 +96,7 @@ def merge(out: Path, folders: Sequence[Path], *, keep_first: bool = False, accep
             "workers": merged.workers,
         }
         with storage.whole(out / FILE) as part, closing(sqlite3.connect(part)) as db:
-            db.executescript(f"BEGIN; {SCHEMA} PRAGMA user_version = {VERSION}; COMMIT;")
+            create(db)
             with db:
                 for name, row in ((name, row) for name, rows in tables.items() for row in rows):
                     insert(db, name, row)
@@ -211,11 +210,9 @@ def _link_files(merged: _Merged, out: Path, folders: Sequence[Path]) -> None:
     sources: dict[Path, Path] = {}
     for key, row in merged.episodes.items():
         home = merged.home[key]
-        paths = [storage.require_below(path) for path in json.loads(row["videos"])]
+        paths: list[str] = json.loads(row["videos"])
         if row["trajectory"] is not None:
-            numbers = home / storage.require_below(row["trajectory"])
-            seen = sorted(numbers.parent.glob(f"{escape(numbers.stem)}_*.mp4"))
-            paths += [str(path.relative_to(home)) for path in (*seen, numbers)]
+            paths += [*storage.images_beside(home, row["trajectory"]), row["trajectory"]]
         for path in paths:
             sources[out / path] = storage.require_there(storage.inside(home, path))
     for folder in folders:
@@ -256,20 +253,21 @@ def combined(folders: Sequence[Results]) -> Results:
         weights, checkpoint = stated(cell, "weights"), stated(cell, "checkpoint")
         if weights is not None and known.setdefault((cell.contender, checkpoint), weights) != weights:
             clashing.add(cell.policy)
-    base = Path(os.path.commonpath([each.out.resolve() for each in folders]))
+    homes = [each.out.resolve() for each in folders]
+    base = Path(os.path.commonpath(homes))
     cells: list[CellResults] = []
     runs: list[Run] = []
     policies: dict[str, dict[str, Any]] = {}
     workers: list[Worker] = []
     # The folders' last parts or, if some are the same, their paths under `base`.
-    labels = [each.out.resolve().name for each in folders]
+    labels = [home.name for home in homes]
     if len(set(labels)) < len(labels):
-        labels = [str(each.out.resolve().relative_to(base)) for each in folders]
-    for each, label in zip(folders, labels, strict=True):
+        labels = [str(home.relative_to(base)) for home in homes]
+    for each, home, label in zip(folders, homes, labels, strict=True):
         names = {
             cell.policy: f"{cell.policy} ({label})" if cell.policy in clashing else cell.policy for cell in each.cells
         }
-        prefix = each.out.resolve().relative_to(base)
+        prefix = home.relative_to(base)
         for cell in each.cells:
             episodes = tuple(
                 replace(one, run=one.run + len(runs), videos=tuple(str(prefix / video) for video in one.videos))
@@ -282,5 +280,5 @@ def combined(folders: Sequence[Results]) -> Results:
             replace(one, policy=names.get(one.policy, one.policy), run=one.run + len(runs)) for one in each.workers
         ]
         runs += [replace(run, run=run.run + len(runs)) for run in each.runs]
-    parts = tuple(sorted((each.out.resolve() for each in folders), reverse=True))  # subfolders before their parents
+    parts = tuple(sorted(homes, reverse=True))  # subfolders before their parents
     return Results(base, tuple(cells), tuple(runs), policies, tuple(workers), parts)

@@ -49,7 +49,6 @@ class WandbRun:
     """
 
     def __init__(self, about: About) -> None:
-        """Begin the run, or resume it."""
         self._wandb: Any = require("wandb")
         self._id = about.id
         # Code is in the config and in an artifact, as wandb would only read the driver's folder.
@@ -210,7 +209,9 @@ class TrackerFeed:
                 )
                 if not over or logged.get(part) == group.episodes:
                     continue
-                run = self._run(name, results, cells[0].policy)
+                policy = cells[0].policy
+                if (run := self._runs.get((name, policy))) is None:
+                    run = self._runs[name, policy] = _RUNS[name](self._about(results, policy))
                 rates = {"success_once": group.success_once.rate, "success_at_end": group.success_at_end.rate}
                 values = rates | {"return": group.mean_return, "steps": group.mean_steps, "episodes": group.episodes}
                 label = "/".join(filter(None, (group.suite, group.env)))
@@ -221,11 +222,6 @@ class TrackerFeed:
                     run.videos(label, videos, cells[0].step)
                 with db:
                     db.execute("INSERT OR REPLACE INTO tracked VALUES (?, ?, ?)", (name, part, group.episodes))
-
-    def _run(self, name: Tracker, results: Results, policy: str) -> TrackerRun:
-        if (name, policy) not in self._runs:
-            self._runs[name, policy] = _RUNS[name](self._about(results, policy))
-        return self._runs[name, policy]
 
     def _about(self, results: Results, policy: str) -> About:
         out, names = self._config.out, self._config.tracking

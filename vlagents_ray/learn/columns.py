@@ -115,18 +115,14 @@ def log_ratio(learner: Any, server: Any) -> LogRatio:
     return LogRatio(float(ratios.mean()), float(ratios.std()), ratios.size)
 
 
-def _view(pa: Any, column: Any) -> np.ndarray:
+def _view(pa: Any, column: Any) -> Any:
     if isinstance(column, pa.ListArray):
         return _view(pa, column.flatten())
     if isinstance(column, pa.FixedShapeTensorArray):
-        tensor: np.ndarray = column.to_numpy_ndarray()
-        return tensor
+        return column.to_numpy_ndarray()
     if isinstance(column, pa.DictionaryArray):
-        words = np.array(column.dictionary.to_pylist(), object)
-        text: np.ndarray = words[column.indices.to_numpy()]
-        return text
-    numbers: np.ndarray = column.to_numpy(zero_copy_only=True)
-    return numbers
+        return np.array(column.dictionary.to_pylist(), object)[column.indices.to_numpy()]
+    return column.to_numpy(zero_copy_only=True)
 
 
 def tensors(pa: Any, values: np.ndarray) -> Any:

@@ -7,13 +7,12 @@ import json
 import logging
 import os
 from collections.abc import Mapping, Sequence
-from contextlib import closing, suppress
+from contextlib import AbstractContextManager, closing, suppress
 from dataclasses import asdict
 from itertools import chain
 from typing import Any
 from urllib.parse import urlencode
 
-from typing_extensions import Self
 from websockets.exceptions import ConnectionClosed
 
 from vlagents_ray.client.credentials import Credentials
@@ -37,7 +36,7 @@ _PUSH_S = 600.0  # time limit for a push, which includes the transfer to all nod
 _WINDOW = 16  # parts (MiB) in flight over the network: with one, each would take a round trip
 
 
-class Publisher:
+class Publisher(AbstractContextManager["Publisher"]):
     """Pushes new weights from the learner's memory to a served policy, without a checkpoint on disk.
 
         with Publisher("serve://pi0") as weights:  # or "https://gpu:8000", with a key of the scope "weights"
@@ -162,9 +161,6 @@ class Publisher:
     def close(self) -> None:
         """End the use of the policy, which keeps its weights."""
 
-    def __enter__(self) -> Self:
-        return self
-
     def __exit__(self, *exc: object) -> None:
         self.close()
 
@@ -177,7 +173,6 @@ class EngineTarget:
     """
 
     def __init__(self, engine: Engine) -> None:
-        """Push to that engine alone."""
         self._engine = engine
 
     def push(self, named: Mapping[str, Any], options: PushOptions) -> int:

@@ -8,13 +8,12 @@ import math
 import os
 import sys
 import threading
-from collections.abc import Callable, Mapping, Sequence
-from contextlib import ExitStack
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import AbstractContextManager, ExitStack
 from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
-from typing_extensions import Self
 
 from vlagents_ray.errors import ConfigError, EnvFailed, PolicyFailed, WeightsLost, from_code
 from vlagents_ray.evaluate.artifacts.recorder import Artifacts, EpisodeRecorder
@@ -42,7 +41,6 @@ class TransitionRecorder(EpisodeRecorder):
     def __init__(
         self, _config: EvalConfig, _hz: float | None, *, want: Sequence[str] = (), images: bool = True
     ) -> None:
-        """Begin an episode."""
         self._pa: Any = require("pyarrow", extra=EXTRA)
         self._want, self._images = tuple(want), images
         self.request_info: Mapping[str, Any] = {WANT: list(want)} if want else {}
@@ -115,9 +113,6 @@ class TransitionRecorder(EpisodeRecorder):
         """Return the transitions of a whole episode; none of one that an error of the policy ended."""
         if result.status != "done":
             return Artifacts()
-        return Artifacts(transitions=self._batch(result))
-
-    def _batch(self, result: EpisodeResult) -> Any:
         pa, rows = self._pa, len(self._rows)
         actions, rewards, success, acts, versions, sources = zip(*self._rows, strict=True)
         last = np.arange(rows) == rows - 1
@@ -143,7 +138,7 @@ class TransitionRecorder(EpisodeRecorder):
         begun = np.diff(acts, prepend=-1) != 0  # first rows of each act
         columns |= {f"{REPLAY}.{name}": at_rows(pa, values.all(), begun) for name, values in self._replay.items()}
         columns["source"] = pa.array(list(sources), pa.string()).dictionary_encode()
-        return pa.RecordBatch.from_pydict(columns)
+        return Artifacts(transitions=pa.RecordBatch.from_pydict(columns))
 
 
 class _Rows:
@@ -255,7 +250,7 @@ class RolloutPlan:
         return EvalConfig.model_validate({**document, **self.settings})
 
 
-class Rollouts:
+class Rollouts(AbstractContextManager["Rollouts"], Iterator[Any]):
     """Plays episodes in the workers of an evaluation, and returns their transitions for a learner.
 
         with Rollouts(RolloutPlan("tabletop/lift", "http://localhost:8000", workers=4)) as rollouts:
@@ -323,17 +318,13 @@ class Rollouts:
         """The number of the next episode: keep it in the learner's checkpoint, to continue with `first`."""
         return self._position
 
-    def __iter__(self) -> Self:
-        return self
-
     def __next__(self) -> Any:
         """Return the transitions of the next episode, a `pyarrow.RecordBatch`.
 
         A thread hands later episodes to the workers meanwhile, also until the next call: two for each environment.
         """
-        delivered: list[Any] = []
-        while not delivered:
-            delivered = self._deliver(self._position + 1, self._limit())
+        while not (delivered := self._deliver(self._position + 1, self._limit())):
+            pass  # it was lost
         return delivered[0]
 
     def collect(self, episodes: int) -> Any:
@@ -353,10 +344,8 @@ class Rollouts:
         """
         if episodes < 1 or episodes % self._settings.groups:
             raise ConfigError(f"collect: got {episodes} episodes, want a multiple of groups, {self._settings.groups}")
-        batches: list[Any] = []
-        while not batches:
-            end = self._position + episodes
-            batches = self._deliver(end)
+        while not (batches := self._deliver(self._position + episodes)):
+            pass  # all were lost
         try:
             return self._pa.Table.from_batches(batches)
         except (self._pa.ArrowInvalid, ValueError) as error:
@@ -372,9 +361,6 @@ class Rollouts:
         if self._pool is not None:
             self._pool.close()
         self._end(None, None, None)
-
-    def __enter__(self) -> Self:
-        return self
 
     def __exit__(self, *exc: Any) -> None:
         if exc[0] is None:
@@ -396,8 +382,7 @@ class Rollouts:
         At the pace of the last push, an episode with a higher number would be too old when it is its turn. Without this
         limit, learners that once were slow would for ever get episodes that are played twice.
         """
-        after = self._position + 1
-        limit = after // self._block * self._block + self._ahead
+        limit = (self._position + 1) // self._block * self._block + self._ahead
         episodes, versions = self._pace
         if self._settings.max_lag is None or self._position >= self._since + episodes:  # slower than at the last push
             return limit

@@ -24,15 +24,16 @@ Autoreset = Literal["same_step", "next_step", "disabled"]
 _RESET_MASK = "reset_mask"  # Gymnasium's name of the option
 
 
-def action_space(spaces: Any, contract: Contract) -> Any:
+def action_space(contract: Contract) -> Any:
     """Return Box (D,) float32 within the contract's bounds; raises `ConfigError` if the contract lacks D."""
     spec = contract.action
     low, high = (-np.inf if spec.low is None else spec.low), (np.inf if spec.high is None else spec.high)
-    return spaces.Box(low, high, (_stated(spec.dim, "action.dim"),), np.float32)
+    return gymnasium.spaces.Box(low, high, (_stated(spec.dim, "action.dim"),), np.float32)
 
 
-def observation_space(spaces: Any, contract: Contract, observation: Observation) -> Any:
+def observation_space(contract: Contract, observation: Observation) -> Any:
     """Return the space of `observed`; raises `ConfigError` if the contract does not state a size."""
+    spaces = gymnasium.spaces
     state = {
         f"state/{name}": spaces.Box(-np.inf, np.inf, (_stated(spec.dim, f"state {name!r}: dim"),), np.float32)
         for name, spec in sorted((contract.state or {}).items())
@@ -154,8 +155,8 @@ class BatchVectorEnv(vector.VectorEnv):  # type: ignore[misc]
         self._contract = batch.contract
         self.num_envs = batch.num_envs
         self.metadata = {"render_modes": [], "autoreset_mode": autoreset}
-        self.single_observation_space = observation_space(gymnasium.spaces, self._contract, observation)
-        self.single_action_space = action_space(gymnasium.spaces, self._contract)
+        self.single_observation_space = observation_space(self._contract, observation)
+        self.single_action_space = action_space(self._contract)
         self.observation_space = vector.utils.batch_space(self.single_observation_space, self.num_envs)
         self.action_space = vector.utils.batch_space(self.single_action_space, self.num_envs)
         self._seed: int | None = None  # of episode 0

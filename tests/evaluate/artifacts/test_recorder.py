@@ -120,7 +120,7 @@ def test_nothing_is_encoded_or_collected_unless_it_is_asked_for(
     def fail(*args: object) -> None:
         raise AssertionError
 
-    monkeypatch.setattr(VideoRecorder, "add", fail)
+    monkeypatch.setattr(VideoRecorder, "add_observation", fail)
     monkeypatch.setattr(TrajectoryRecorder, "add_observation", fail)
     monkeypatch.setattr(PlayedEpisode, "add_observation", fail)
     with closing(Recording(config(video="none", record="none"), 10.0)) as recording:
@@ -170,7 +170,7 @@ COLOURS = [(200, 40, 40), (40, 200, 40), (40, 40, 200), (220, 220, 220), (20, 20
 def record(frames: list[np.ndarray], fps: float | None = None) -> dict[str, bytes]:
     with closing(VideoRecorder(fps)) as recorder:
         for frame in frames:
-            recorder.add(Obs(cameras={"front": frame}))
+            recorder.add_observation(Obs(cameras={"front": frame}))
         return recorder.finish()
 
 
@@ -206,7 +206,7 @@ def test_odd_sizes_are_made_even() -> None:
 
 def test_every_camera_has_its_video() -> None:
     with closing(VideoRecorder()) as recorder:
-        recorder.add(Obs(cameras={"front": plain(COLOURS[0], 128, 128), "wrist": plain(COLOURS[1])}))
+        recorder.add_observation(Obs(cameras={"front": plain(COLOURS[0], 128, 128), "wrist": plain(COLOURS[1])}))
         videos = recorder.finish()
     sizes = {}
     for camera, video in videos.items():

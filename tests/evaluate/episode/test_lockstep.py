@@ -16,7 +16,7 @@ from in_process_replicas import Replicas
 from vlagents_ray.envs.base import BatchEnv, SequentialBatch, make_batch
 from vlagents_ray.envs.tabletop import Tabletop
 from vlagents_ray.errors import ConfigError, ConnectionLost, EnvFailed, VLAgentsError
-from vlagents_ray.evaluate.episode.episode import EpisodeSettings, run_episodes
+from vlagents_ray.evaluate.episode.episode import run_episodes
 from vlagents_ray.evaluate.episode.records import EpisodeResult
 from vlagents_ray.evaluate.plan.config import ClockConfig
 from vlagents_ray.evaluate.plan.jobs import EpisodeKey
@@ -52,7 +52,7 @@ def untimed(results: Sequence[EpisodeResult | VLAgentsError]) -> list[EpisodeRes
 
 def together(env: BatchEnv, agent: Agent, wanted: Sequence[EpisodeKey], *, images: bool = True, **settings: Any) -> Any:
     sessions = [copy.deepcopy(agent) for _ in wanted]
-    return run_episodes(env, agent, sessions, wanted, EpisodeSettings(**settings), images=images)
+    return run_episodes(env, agent, sessions, wanted, **settings, images=images)
 
 
 @pytest.mark.parametrize("execute", [None, 2])

@@ -20,7 +20,7 @@ from vlagents_ray.evaluate.episode.records import EpisodeResult, Status
 from vlagents_ray.evaluate.plan.cases import EvalCase, cells
 from vlagents_ray.evaluate.plan.config import EvalConfig
 from vlagents_ray.evaluate.plan.jobs import EpisodeKey, Job, plan
-from vlagents_ray.evaluate.report import results_document
+from vlagents_ray.evaluate.report import results_document, terminal
 from vlagents_ray.evaluate.report.results_document import ProgressDocument, ResultsDocument
 from vlagents_ray.evaluate.report.terminal import LineProgress, LiveProgress, Progress
 from vlagents_ray.evaluate.results.reader import rate_of
@@ -290,7 +290,8 @@ def test_a_cell_that_may_stop_early_shows_its_confidence_sequence() -> None:
 
 def test_lines_are_sparse(monkeypatch: pytest.MonkeyPatch) -> None:
     out = StringIO()
-    progress = LineProgress(Console(file=out, width=120), every_s=1e9)
+    monkeypatch.setattr(terminal, "LINE_EVERY_S", 1e9)
+    progress = LineProgress(Console(file=out, width=120))
     many = planned(100)
     progress.begin([many], {}, many.planned)
     for i in range(100):

@@ -142,7 +142,7 @@ def test_only_failed_episodes_are_rendered_wholly_and_show_what_a_video_of_all_s
     every, [_, shown] = rendered(rollout_of(config, lambda: ToZero(3), **{kept: "all"}), solved, failed)
     assert few == [4, 4 + 11]
     assert every == [11, 11]
-    assert (first.artifacts.footage.shown, first.artifacts.footage.seen, first.artifacts.trajectory) == ({}, {}, None)
+    assert (first.artifacts.shown, first.artifacts.seen, first.artifacts.trajectory) == ({}, {}, None)
     assert second.artifacts == shown.artifacts
     assert second.result is not None
     assert shown.result is not None
@@ -154,7 +154,7 @@ def test_a_worker_whose_episodes_mostly_fail_renders_them_as_it_plays(config: Co
     worker = rollout_of(config, lambda: ToZero(3), video="failures")
     images, reports = rendered(worker, *seeds[False][:2], seeds[True][0], seeds[True][1])
     assert images == [4 + 11, 11, 11, 11]
-    assert [bool(report.artifacts.footage.shown) for report in reports] == [True, True, False, False]
+    assert [bool(report.artifacts.shown) for report in reports] == [True, True, False, False]
 
 
 def test_episodes_side_by_side_are_rendered_again_one_by_one(config: Config) -> None:
@@ -174,9 +174,9 @@ def test_episodes_side_by_side_are_rendered_again_one_by_one(config: Config) -> 
         )
         for video in ("failures", "all")
     }
-    assert found["failures"][0].artifacts.footage.shown == {}
+    assert found["failures"][0].artifacts.shown == {}
     assert found["failures"][1].artifacts == found["all"][1].artifacts
-    assert found["failures"][1].artifacts.footage.shown
+    assert found["failures"][1].artifacts.shown
 
 
 def test_progress_tells_phase_age_and_place(config: Config, monkeypatch: pytest.MonkeyPatch) -> None:

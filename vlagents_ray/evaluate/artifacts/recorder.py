@@ -30,22 +30,14 @@ from vlagents_ray.naming import distinct, plain
 DEFAULT_FPS = 20.0  # for an env whose contract has no control rate
 
 
-@dataclass(frozen=True, slots=True)
-class Footage:
-    """MP4 files by camera, each with a frame for every observation; {} if they are not recorded."""
-
-    shown: dict[str, bytes] = field(default_factory=dict)  # for people
-    seen: dict[str, bytes] = field(default_factory=dict)  # for the trajectory
-
-
-class VideoRecorder:
+class VideoRecorder(EpisodeObserver):
     """Videos of one episode, one for each camera. `close` frees the encoders."""
 
     def __init__(self, fps: float | None = None) -> None:
         self._fps = fps or DEFAULT_FPS
         self._tracks: dict[str, tuple[io.BytesIO, Mp4]] = {}  # by camera
 
-    def add(self, obs: Obs) -> None:
+    def add_observation(self, obs: Obs) -> None:
         """Append every camera's image, (H, W, 3) uint8 RGB."""
         for name, image in obs.cameras.items():
             if name not in self._tracks:
@@ -207,9 +199,13 @@ def _shapes(state: Mapping[str, np.ndarray]) -> dict[str, tuple[int, ...]]:
 
 @dataclass(frozen=True, slots=True)
 class Artifacts:
-    """The recorded files of an episode, as the worker sends them to the driver with its result."""
+    """The recorded files of an episode, as the worker sends them to the driver with its result.
 
-    footage: Footage = field(default_factory=Footage)
+    An MP4 file has a frame for every observation.
+    """
+
+    shown: dict[str, bytes] = field(default_factory=dict)  # MP4s for people, by camera
+    seen: dict[str, bytes] = field(default_factory=dict)  # those of the trajectory
     trajectory: bytes | None = None  # a `Trajectory` as .npz
     transitions: Any = None  # a pyarrow.RecordBatch, for a learner
     not_repeatable: str | None = None  # reason for images that the second pass did not render
@@ -241,7 +237,8 @@ class Recording(EpisodeRecorder):
         self._wants_video, self._wants_trajectory = config.video, config.record
         self._video = VideoRecorder(fps)
         self._trajectory, self._played = TrajectoryRecorder(), PlayedEpisode()
-        self._observers: list[EpisodeObserver] = [self._played] if self.wants_images == "failures" else []
+        self._observers: list[EpisodeObserver] = [self._video] if self.wants_images != "none" else []
+        self._observers += [self._played] if self.wants_images == "failures" else []
         self._observers += [self._trajectory] if self._wants_trajectory != "none" else []
 
     @property
@@ -250,7 +247,6 @@ class Recording(EpisodeRecorder):
         return "all" if "all" in wanted else "failures" if "failures" in wanted else "none"
 
     def add_observation(self, obs: Obs) -> None:
-        self._show(obs)
         for observer in self._observers:
             observer.add_observation(obs)
 
@@ -268,17 +264,11 @@ class Recording(EpisodeRecorder):
             return Artifacts()
         if self._played.lacks_images:
             self._video.close()
-            if (reason := second_pass(self._played, self._show)) is not None:
+            if (reason := second_pass(self._played, self._video.add_observation)) is not None:
                 return Artifacts(not_repeatable=reason)
         videos = self._video.finish()
-        return Artifacts(
-            Footage(videos if video else {}, videos if trajectory else {}),
-            self._trajectory.finish().to_bytes() if trajectory else None,
-        )
-
-    def _show(self, obs: Obs) -> None:
-        if self._wants_video != "none" or self._wants_trajectory != "none":
-            self._video.add(obs)
+        numbers = self._trajectory.finish().to_bytes() if trajectory else None
+        return Artifacts(videos if video else {}, videos if trajectory else {}, numbers)
 
     def close(self) -> None:
         self._video.close()
@@ -290,17 +280,17 @@ def save(out: Path, cell: EvalCase, result: EpisodeResult, kept: Artifacts) -> t
     A trajectory is `out/trajectories/POLICY/SUITE/ENV/epNNNN_seedS.npz`, with `_CAMERA.mp4`. Its videos that are also
     shown are links, and the .npz is written last: if it exists, the other files do.
     """
-    videos = save_videos(out, cell, result, kept.footage.shown)
+    videos = save_videos(out, cell, result, kept.shown)
     folder = _folder_for(out, storage.TRAJECTORIES, cell, result)
     if kept.trajectory is None:
         return videos, None
-    path, saved = folder / f"{_stem(result)}.npz", dict(zip(kept.footage.shown, videos, strict=True))
-    for camera, file in videos_of(path, kept.footage.seen).items():
+    path, saved = folder / f"{_stem(result)}.npz", dict(zip(kept.shown, videos, strict=True))
+    for camera, file in videos_of(path, kept.seen).items():
         if camera in saved:
             storage.link_or_copy(out / saved[camera], file)
         else:
             with storage.whole(file) as part:
-                part.write_bytes(kept.footage.seen[camera])
+                part.write_bytes(kept.seen[camera])
     with storage.whole(path) as part:
         part.write_bytes(kept.trajectory)
     return videos, str(path.relative_to(out))

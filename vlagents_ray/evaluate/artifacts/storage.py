@@ -10,6 +10,7 @@ import sqlite3
 import tempfile
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
+from glob import escape
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path, PurePosixPath
 from typing import Any
@@ -23,7 +24,6 @@ VIDEOS, TRAJECTORIES, PROVENANCE = "videos", "trajectories", "provenance"
 _RESUME = "what was recorded is kept: go on with --resume"
 _FULL = f"make room; {_RESUME}"
 _REFUSED = "make it writable, or choose another folder"
-_BROKEN = f"see the system's log (dmesg), and mend the disk; {_RESUME}"
 _CURES = {
     errno.ENOSPC: ("the disk is full", _FULL),
     errno.EDQUOT: ("your quota on this disk is used up", _FULL),
@@ -33,7 +33,7 @@ _CURES = {
     errno.EPERM: ("you may not write there", _REFUSED),
     errno.ENOTDIR: ("something on the way there is no folder", "choose another folder"),
     errno.EEXIST: ("is there, and no folder", "choose another folder"),
-    errno.EIO: ("the disk reports an error", _BROKEN),
+    errno.EIO: ("the disk reports an error", f"see the system's log (dmesg), and mend the disk; {_RESUME}"),
     errno.ESTALE: ("the file server has lost the folder", f"mount it again; {_RESUME}"),
 }
 # SQLite reports these texts in place of the system's errno.
@@ -72,6 +72,12 @@ def inside(home: Path, path: str) -> Path:
             f"into the folder in its place"
         )
     return found
+
+
+def images_beside(home: Path, trajectory: str) -> list[str]:
+    """Return the MP4s of the policy's images beside a trajectory in the folder of results `home`, relative to it."""
+    numbers = home / require_below(trajectory)
+    return [str(path.relative_to(home)) for path in sorted(numbers.parent.glob(f"{escape(numbers.stem)}_*.mp4"))]
 
 
 def require_there(path: Path) -> Path:

@@ -46,8 +46,7 @@ class EpisodeStats:
     success: bool = False
     first_success: int | None = None
     ending: Ending = "error"
-    instruction: str = ""  # the present one
-    earlier: list[str] = field(default_factory=list)  # instructions of this episode before it
+    instructions: list[str] = field(default_factory=list)  # one after the other; the last is the present one
     checkpoint: str | None = None
     weights: str | None = None
     revision: str | None = None
@@ -71,10 +70,6 @@ class EpisodeStats:
             for name in ("checkpoint", "weights", "revision")
         )
 
-    def instructed(self, instruction: str) -> None:
-        self.earlier.append(self.instruction)
-        self.instruction = instruction
-
     def acted(self, act: Act, seconds: float, latency_s: float | None) -> None:
         """Record an answer of the policy, its duration and, in real-time mode, its latency."""
         self.act_ms.append(1e3 * seconds)
@@ -91,21 +86,6 @@ class EpisodeStats:
         if latency_s is not None:
             self.latency_ms.append(1e3 * latency_s)
 
-    def stepped(self, tick: Tick, step: failures.EnvStep, limit: int) -> bool:
-        """Record that `tick` was executed; return whether the episode is over, also by the `limit` of steps."""
-        self.steps += 1
-        self.ticks_waited += tick.waited
-        self.ticks_held += tick.held
-        self.actions.update(tick.action.astype(_LITTLE_ENDIAN, copy=False).tobytes())
-        self.episode_return += step.reward
-        self.success = step.success
-        if self.success and self.first_success is None:
-            self.first_success = self.steps
-        over = step.terminated or step.truncated or self.steps >= limit
-        if over:
-            self.ending = "terminated" if step.terminated else "truncated"
-        return over
-
     def result(self, transport: str, failed: PolicyFailed | None = None) -> EpisodeResult:
         """Return the result of the finished episode; `failed` is the policy error that ended it, if any."""
         kept = {name: getattr(self, name) for name in _KEPT}
@@ -116,7 +96,7 @@ class EpisodeStats:
             success_at_end=self.success and failed is None,
             first_success=self.first_success if failed is None else None,
             ending=self.ending if failed is None else "error",
-            instruction="; ".join([*self.earlier, self.instruction]),
+            instruction="; ".join(self.instructions),
             error=None if failed is None else f"{failed.code}: {failed}",
             seconds=perf_counter() - self.started,
             env_step_ms=_quantile(self.step_ms, 0.5),
@@ -142,25 +122,16 @@ Watch = Callable[[Phase, int], None]  # called with the phase that begins and th
 _ACTING, _STEPPING = failures.policy_side("act"), failures.env_side("step")  # entered at each step
 
 
-@dataclass(frozen=True, slots=True)
-class EpisodeSettings:
-    """The settings of episodes of one cell."""
-
-    execute: int | None = None  # rows of each action chunk that are executed, open loop; None: all
-    # Real-time mode, in which each episode's time passes while the policy computes (see `latency`); None: the
-    # environments wait for the policy.
-    clock: ClockConfig | None = None
-    reset_options: Mapping[str, Any] = field(default_factory=dict)  # of each reset of an environment
-    policy_options: Mapping[str, Any] = field(default_factory=dict)  # of each reset of the policy
-
-
 def run_episodes(
     env: BatchEnv,
     agent: Agent,
     sessions: Sequence[Agent],
     keys: Sequence[EpisodeKey],
-    settings: EpisodeSettings = EpisodeSettings(),
     *,
+    execute: int | None = None,
+    clock: ClockConfig | None = None,
+    reset_options: Mapping[str, Any] | None = None,
+    policy_options: Mapping[str, Any] | None = None,
     observers: Sequence[EpisodeObserver] = (),
     watch: Watch = lambda _phase, _steps: None,
     images: bool = True,
@@ -175,7 +146,11 @@ def run_episodes(
     Args:
         sessions: The session of each episode.
         keys: Environment, number and seed of each episode.
-        settings: The common settings of the episodes.
+        execute: The rows of each action chunk that are executed, open loop; None: all.
+        clock: Real-time mode, in which each episode's time passes while the policy computes (see `latency`); None: the
+            environments wait for the policy.
+        reset_options: The options of each reset of an environment.
+        policy_options: The options of each reset of the policy.
         observers: The observer of each episode, or none.
         watch: Called before each phase that may take long.
         images: Whether the observers need the images of every step. If not, the environments may leave out those
@@ -201,22 +176,22 @@ def run_episodes(
         contract = env.contract
         seen = env.reset(
             seeds=[key.seed for key in keys],
-            options=[options_of_reset(env, key.episode, settings.reset_options) for key in keys],
+            options=[options_of_reset(env, key.episode, reset_options) for key in keys],
         )
         first = [
             (failures.checked_obs(obs, contract, "reset"), failures.checked_instruction(text, "reset"))
             for obs, text in zip(seen, env.instructions, strict=True)
         ]
     reset_ms = 1e3 * (perf_counter() - begun)
-    executor = partial(ChunkExecutor, settings.execute, settings.clock, contract)
+    executor = partial(ChunkExecutor, execute, clock, contract)
     watched = observers or [EpisodeObserver()] * len(keys)
     episodes = []
     for i, (key, session, observer, (obs, text)) in enumerate(zip(keys, sessions, watched, first, strict=True)):
         observer.add_observation(obs)
-        stats = EpisodeStats(key, begun, instruction=text, reset_ms=reset_ms)
+        stats = EpisodeStats(key, begun, instructions=[text], reset_ms=reset_ms)
         episodes.append(_Episode(i, session, stats, observer, executor, obs))
     watch("policy reset", 0)
-    _reset_policy(agent, episodes, contract, settings.policy_options)
+    _reset_policy(agent, episodes, contract, policy_options or {})
     steps, playing = 0, _unfinished(episodes)
     while playing:
         if requesting := [episode for episode in playing if not episode.ticks]:
@@ -231,7 +206,7 @@ def run_episodes(
             steps, playing = steps + 1, _unfinished(playing)
             if env.several_tasks and (begun_anew := _instructed(env, playing)):
                 watch("policy reset", steps)
-                _reset_policy(agent, begun_anew, contract, settings.policy_options)
+                _reset_policy(agent, begun_anew, contract, policy_options or {})
                 playing = _unfinished(playing)
     return [episode.outcome for episode in episodes if episode.outcome is not None]
 
@@ -271,7 +246,7 @@ class _Episode:
 
     def instructed(self, instruction: str) -> None:
         """Begin a further task, and drop the rest of the plan, which was for the last one."""
-        self.stats.instructed(instruction)
+        self.stats.instructions.append(instruction)
         self.ticks.clear()
         self._executor, self._done = self.new_executor(), False
 
@@ -299,14 +274,23 @@ class _Episode:
             self.failed(error)
 
     def stepped(self, step: failures.EnvStep, limit: int) -> None:
-        """Record the outputs of the next of `ticks`."""
+        """Record that the next of `ticks` was executed; the episode may be over, also by the `limit` of steps."""
         self.observer.add_observation(step.obs)
-        self.obs, tick = step.obs, self.ticks.popleft()
-        over = self.stats.stepped(tick, step, limit)
-        if not over and self._done and not self.ticks:
-            self.stats.ending, over = "policy_done", True
+        self.obs, tick, stats = step.obs, self.ticks.popleft(), self.stats
+        stats.steps += 1
+        stats.ticks_waited += tick.waited
+        stats.ticks_held += tick.held
+        stats.actions.update(tick.action.astype(_LITTLE_ENDIAN, copy=False).tobytes())
+        stats.episode_return += step.reward
+        stats.success = step.success
+        if stats.success and stats.first_success is None:
+            stats.first_success = stats.steps
+        if over := step.terminated or step.truncated or stats.steps >= limit:
+            stats.ending = "terminated" if step.terminated else "truncated"
+        elif over := self._done and not self.ticks:
+            stats.ending = "policy_done"
         if over:
-            self.outcome = self.stats.result(transport_of(self.session))
+            self.outcome = stats.result(transport_of(self.session))
         self.observer.add_action(tick.action, step.reward, step.success)
 
     def failed(self, error: VLAgentsError) -> None:
@@ -320,7 +304,7 @@ def _instructed(env: BatchEnv, playing: Sequence[_Episode]) -> list[_Episode]:
     """Return the episodes whose environment has a further task."""
     with _STEPPING:
         texts = env.instructions if playing else []
-        found = [one for one in playing if texts[one.number] != one.stats.instruction]
+        found = [one for one in playing if texts[one.number] != one.stats.instructions[-1]]
         for episode in found:
             episode.instructed(failures.checked_instruction(texts[episode.number], "step"))
     return found
@@ -329,7 +313,7 @@ def _instructed(env: BatchEnv, playing: Sequence[_Episode]) -> list[_Episode]:
 def _reset_policy(agent: Agent, episodes: Sequence[_Episode], contract: Contract, options: Mapping[str, Any]) -> None:
     """Reset the session of each episode with its observation, in one message to a server."""
     keys, sessions = [one.stats.key for one in episodes], [one.session for one in episodes]
-    first, texts = [one.obs for one in episodes], [one.stats.instruction for one in episodes]
+    first, texts = [one.obs for one in episodes], [one.stats.instructions[-1] for one in episodes]
     seeds = [key.seed if key.policy_seed is None else key.policy_seed for key in keys]
     given = {**options, "env": keys[0].env}
     if hasattr(agent, "metadata"):  # a server also compares the contract, and answers 409

@@ -55,7 +55,6 @@ class EvalCase:
 
     @property
     def policy_options(self) -> dict[str, Any]:
-        """The options of every reset of the policy."""
         return self.policy.options | ({"checkpoint_step": self.step} if self.policy.steps else {})
 
     @property
@@ -102,7 +101,6 @@ class EvalCase:
 
     @property
     def planned(self) -> int:
-        """Episodes of all seeds together."""
         return self.suite.episodes * len(self.suite.seeds)
 
 
@@ -120,7 +118,6 @@ def env_program(cell: EvalCase, code: Callable[[str], Program] = code_of_class) 
 
 
 def contender(policy: str, step: int | None) -> str:
-    """Return the id of a policy at its checkpoint."""
     return policy if step is None else f"{policy}@{step}"
 
 

@@ -42,11 +42,6 @@ class StepRange(_PlanModel):
     last: NonNegativeInt
     every: PositiveInt
 
-    @property
-    def steps(self) -> range:
-        """All these steps."""
-        return range(self.first, self.last + 1, self.every)
-
 
 class PushedWeights(_PlanModel):
     """Weights that a learner pushed, as `act.info["policy"]` names them."""
@@ -78,7 +73,10 @@ class PolicyConfig(_PlanModel):
     @field_validator("steps", mode="before")
     @classmethod
     def _range(cls, steps: object) -> object:
-        return list(StepRange.model_validate(steps).steps) if isinstance(steps, dict) else steps
+        if not isinstance(steps, dict):
+            return steps
+        given = StepRange.model_validate(steps)
+        return list(range(given.first, given.last + 1, given.every))
 
     @field_validator("steps")
     @classmethod

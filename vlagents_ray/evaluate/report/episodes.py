@@ -174,7 +174,6 @@ def failures(results: Results, gallery: Gallery) -> Failures | None:
 
 def errors(results: Results) -> Errors | None:
     """Return the errors with their logs; None without any."""
-    recorded = [(cell, one.result) for cell in results.cells for one in cell.episodes]
     broken = errors_of_policies(results)
     attempts = [(cell, attempt) for cell in results.cells for attempt in cell.attempts]
     if not broken and not attempts:
@@ -184,7 +183,7 @@ def errors(results: Results) -> Errors | None:
         attempts[:MOST_LOGS],
         len(attempts),
         sum(attempt.retried for _, attempt in attempts),
-        sum(result.status == "infra_failed" for _, result in recorded),
+        sum(one.result.status == "infra_failed" for cell in results.cells for one in cell.episodes),
     )
 
 

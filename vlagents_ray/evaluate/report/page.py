@@ -49,8 +49,7 @@ class Figure(NamedTuple):
     note: str
 
 
-@dataclass(frozen=True, slots=True)
-class Section:
+class Section(NamedTuple):
     """A part of the page with a heading in the table of contents."""
 
     title: str
@@ -76,7 +75,6 @@ def write_report(results: Results, path: Path, *, inline: bool = False) -> Path:
 
 
 def report(summary: Summary, gallery: Gallery) -> str:
-    """Return the page as text."""
     results, total = summary.results, summary.total
     figures = [
         _solved(summary),
@@ -182,7 +180,6 @@ def latency(summary: Summary) -> Latency | None:
     return Latency(chart, stages, rows, summary.transports, len(timed))
 
 
-PROTOCOL = "protocol"  # key of an env's description: the constants of its benchmark
 _SETTINGS = ("env_options", "reset_options", "clock")
 
 
@@ -212,18 +209,10 @@ class Configuration:
 
 
 @dataclass(frozen=True, slots=True)
-class Again:
-    """The settings of a run as a file, without policies made by Python code."""
-
-    yaml: str
-    lacks_a_policy: bool
-
-
-@dataclass(frozen=True, slots=True)
 class Repeat:
     """The arguments of the commands that repeat the evaluation and this page."""
 
-    runs: list[Again]
+    runs: list[tuple[str, bool]]  # (settings as YAML, whether they lack a policy that Python code made)
     folders: list[str]
 
 
@@ -237,7 +226,7 @@ def protocol(results: Results) -> list[Env]:
     envs = []
     for cell, tasks in alike.values():
         described = dict(cell.described)
-        constants = described.pop(PROTOCOL, None)
+        constants = described.pop("protocol", None)
         of_benchmark = constants if isinstance(constants, Mapping) else None
         settings = {name: value for name in _SETTINGS if (value := cell.settings.get(name))}
         contract = _yaml(cell.contract) if cell.contract else None
@@ -270,7 +259,6 @@ def configuration(results: Results) -> Configuration:
 
 
 def repeat(results: Results) -> Repeat:
-    """Return the commands that repeat the evaluation."""
     folders = list(dict.fromkeys(str(run.config.get("out")) for run in results.runs))
     runs = []
     for run in _last_runs(results):  # without addresses of policies that were served for the run
@@ -280,7 +268,7 @@ def repeat(results: Results) -> Repeat:
             if policy.get("source") is not None:
                 policy.pop("url", None)
         lacks_a_policy = any(not {"source", "url"} & policy.keys() for policy in document["policies"])
-        runs.append(Again(_yaml(document), lacks_a_policy))
+        runs.append((_yaml(document), lacks_a_policy))
     return Repeat(runs, folders)
 
 

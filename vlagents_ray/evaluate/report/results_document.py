@@ -156,7 +156,6 @@ class ProgressDocument(ResultsDocument, Progress):
     """Describes an evaluation as its `Progress`; the page's thread may read it concurrently."""
 
     def __init__(self, out: Path, shown: Progress | None = None, *, goes_on: bool = False) -> None:
-        """Describe the results in a folder."""
         super().__init__(out)
         self.goes_on = goes_on
         self._shown = shown or Progress()
@@ -192,7 +191,6 @@ class ProgressDocument(ResultsDocument, Progress):
             self._change(ENDED)
 
     def fail(self, reason: str) -> None:
-        """Note that an error ended the evaluation."""
         self.reason = reason
         self._change(STOPPED)
 

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 from vlagents_ray.evaluate.report.charts import Glyph, RateChart, Series, difference_glyph, rate_chart
 from vlagents_ray.evaluate.results.comparison import Comparison, Line, comparable, comparisons
-from vlagents_ray.evaluate.results.reader import CellResults, Results, by_timing
+from vlagents_ray.evaluate.results.reader import CellResults, Results, by_timing, rate_of
 from vlagents_ray.evaluate.results.statistics import ERROR_RATE, Pairs, Rate
 from vlagents_ray.evaluate.results.summary import TOTAL, Group, Summary, group_of
 
@@ -44,7 +44,6 @@ class LearningCurve:
 
 
 def success_table(summary: Summary) -> SuccessTable:
-    """Return the first table of the page."""
     total = summary.total
     parts = [part for name in summary.results.contenders for part in summary.parts(name).values()]
     return SuccessTable(
@@ -130,23 +129,19 @@ def _learning_curve(title: str, cells: Sequence[CellResults]) -> LearningCurve |
     if not (swept := {policy: found for policy, found in by_policy.items() if len(found) > 1}):
         return None
     lines = [
-        Series(policy, [(step, _rate(policy, group)) for step, group in sorted(found.items())])
+        Series(policy, [(step, rate_of(group, "success_once")) for step, group in sorted(found.items())])
         for policy, found in swept.items()
     ]
     first, last = min(min(found) for found in swept.values()), max(max(found) for found in swept.values())
     levels = []
     for policy, group in without_steps.items():
-        rate = _rate(policy, group)
+        rate = rate_of(group, "success_once")
         levels.append(Series(f"{policy} (no steps)", [(first, rate), (last, rate)], level=True))
     rows: list[tuple[str, float | None, Rate]] = [(line.name, None, line.points[0][1]) for line in levels]
     rows += [(line.name, step, rate) for line in lines for step, rate in line.points]
     pushed = all("pushed_weights" in cell.settings for cell in cells if cell.step is not None)
     of_axis = "version of the weights" if pushed else "training step"
     return LearningCurve(rate_chart([*lines, *levels], of_axis, title), rows)
-
-
-def _rate(policy: str, cells: Sequence[CellResults]) -> Rate:
-    return group_of((policy, "", TOTAL), cells).success_once
 
 
 @dataclass(frozen=True, slots=True)
@@ -206,7 +201,6 @@ def compare_all(summary: Summary) -> Comparisons | None:
 
 
 def totals(found: Sequence[Comparison]) -> list[Difference]:
-    """Return the differences on all suites together."""
     return [_difference(one, one.total) for one in found]
 
 

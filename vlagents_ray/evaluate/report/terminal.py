@@ -164,9 +164,7 @@ class LiveProgress(_CountedProgress):
         self._live.stop()  # the last state stays on the terminal
 
     def _drawing(self) -> Rows:
-        table = Table(box=None)
-        for title in ("env", "episodes", "success so far"):
-            table.add_column(title)
+        table = Table("env", "episodes", "success so far", box=None)
         for row in self._rows():
             table.add_row(*row)
         return Rows(table, Text(self._overall()))
@@ -175,18 +173,13 @@ class LiveProgress(_CountedProgress):
 class LineProgress(_CountedProgress):
     """Prints a line every few seconds, for logs."""
 
-    def __init__(self, console: Console, every_s: float = LINE_EVERY_S) -> None:
-        super().__init__(console)
-        self._every_s = every_s
-        self._last = 0.0
-
     def begin(self, cells: Sequence[EvalCase], recorded: Mapping[str, Rate], left: int) -> None:
         super().begin(cells, recorded, left)
         self._print_state()
 
     def episode(self, cell: EvalCase, result: EpisodeResult) -> None:
         super().episode(cell, result)
-        if monotonic() - self._last >= self._every_s:
+        if monotonic() - self._last >= LINE_EVERY_S:
             self._print_state()
 
     def end(self) -> None:
@@ -214,12 +207,8 @@ def results_table(summary: Summary) -> Table:
     interval = "the Wilson 95 % interval"
     if error_rate is not None:
         interval = f"the confidence sequence of early stopping (error rate {error_rate:.2g})"
-    table = Table(
-        title=f"{', '.join(names)}: success in %, with {interval}",
-        box=SIMPLE_HEAD,
-        padding=0,
-        pad_edge=False,
-    )
+    title = f"{', '.join(names)}: success in %, with {interval}"
+    table = Table(title=title, box=SIMPLE_HEAD, padding=0, pad_edge=False)
     if len(names) > 1:
         table.add_column("policy", overflow="fold")
     table.add_column("env", overflow="fold")

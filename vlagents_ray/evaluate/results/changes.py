@@ -62,7 +62,6 @@ def policy_changes(subject: str, known: Mapping[str, Any], now: Mapping[str, Any
 
 
 def policy_program(metadata: Mapping[str, Any], *, swept: bool) -> dict[str, str] | None:
-    """Return the program in the metadata of a policy's server, or None."""
     if (program := metadata.get("program")) is None:
         return None
     return {name: value for name, value in program.items() if not (swept and name.startswith(_SWEPT))}

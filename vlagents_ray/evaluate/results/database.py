@@ -62,6 +62,11 @@ CREATE TABLE workers (
 """
 
 
+def create(db: sqlite3.Connection) -> None:
+    """Make the tables of this version, all or none."""
+    db.executescript(f"BEGIN; {SCHEMA} PRAGMA user_version = {VERSION}; COMMIT;")
+
+
 def insert(db: sqlite3.Connection, table: str, row: Mapping[str, Any]) -> None:
     """Insert `row`, its values by the names of their columns, which are those of `SCHEMA`."""
     columns, marks = ", ".join(row), ", ".join("?" * len(row))
@@ -95,9 +100,8 @@ def require_readable(out: Path, db: sqlite3.Connection) -> None:
 
 @functools.cache
 def _known_columns() -> dict[str, set[str]]:
-    """Return the columns of this version, by table."""
     with contextlib.closing(sqlite3.connect(":memory:")) as db:
-        db.executescript(SCHEMA)
+        create(db)
         tables = [name for (name,) in db.execute("SELECT name FROM sqlite_master WHERE type = 'table'")]
         return {table: _columns(db, table) for table in tables}
 

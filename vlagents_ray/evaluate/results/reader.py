@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import dataclasses
 import json
 import sqlite3
 from collections.abc import Iterator, Sequence
 from contextlib import closing, contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Any, Literal
 
@@ -203,7 +202,7 @@ class Results:
 
     def among(self, cells: Sequence[CellResults]) -> Results:
         """Return the same results with these cells only."""
-        return dataclasses.replace(self, cells=tuple(cells))
+        return replace(self, cells=tuple(cells))
 
     def only(self, contender: str | None = None, env: str | None = None) -> Results:
         """Select the cells of a policy or an env.
@@ -218,11 +217,11 @@ class Results:
         Raises:
             ConfigError: No cell is left.
         """
-        left = tuple(one for one in self.cells if contender in (None, one.contender) and env in (None, one.env))
+        left = [one for one in self.cells if contender in (None, one.contender) and env in (None, one.env)]
         if not left:
             have = sorted({f"{one.contender} in {one.env}" for one in self.cells})
             raise ConfigError(f"{self.out}: has nothing of {contender or 'any policy'} in {env or 'any env'}: {have}")
-        return dataclasses.replace(self, cells=left)
+        return self.among(left)
 
 
 @contextmanager
@@ -251,7 +250,7 @@ def table(db: sqlite3.Connection, name: str, order: str = "rowid") -> Iterator[d
 
 def episode_of(row: dict[str, Any]) -> Episode:
     """Return the episode of a row of the table; raises `ConfigError` for a path that leads out of the folder."""
-    names = {field.name for field in dataclasses.fields(EpisodeResult)}
+    names = {field.name for field in fields(EpisodeResult)}
     known = {name: value for name, value in row.items() if name in names and name != "key"}
     for name in ("success_once", "success_at_end"):
         known[name] = None if known[name] is None else bool(known[name])

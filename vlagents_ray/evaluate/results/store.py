@@ -32,16 +32,7 @@ from vlagents_ray.evaluate.results.changes import (
     program_changes,
     program_id,
 )
-from vlagents_ray.evaluate.results.database import (
-    FILE,
-    RUNNING,
-    SCHEMA,
-    VERSION,
-    WAIT_S,
-    insert,
-    lock,
-    require_readable,
-)
+from vlagents_ray.evaluate.results.database import FILE, RUNNING, WAIT_S, create, insert, lock, require_readable
 
 
 class Store(AbstractContextManager["Store"]):
@@ -79,7 +70,6 @@ class Store(AbstractContextManager["Store"]):
         self.close()
 
     def close(self) -> None:
-        """Close the file, and release the lock."""
         self._db.close()
         os.close(self._lock)
 
@@ -195,14 +185,12 @@ class Store(AbstractContextManager["Store"]):
         self._db.execute("UPDATE runs SET changes = ? WHERE run = ?", (value, self._run))
 
     def record_attempt(self, job: Job, failure: Failure, *, retried: bool) -> None:
-        """Record an attempt that failed by infrastructure."""
         where = (str(job.key), job.key.settings, job.attempt, self._run, time.time())
         why = (failure.cause, failure.code, failure.message, failure.traceback, failure.log, retried)
         with self._db:
             self._db.execute("INSERT INTO attempts VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?)", where + why)
 
     def note_worker(self, where: WorkerInfo) -> None:
-        """Record a worker that has connected to a policy or made an env."""
         with self._db:
             insert(self._db, "workers", asdict(where) | {"run": self._run, "at": time.time()})
 
@@ -266,7 +254,7 @@ class Store(AbstractContextManager["Store"]):
         db = sqlite3.connect(self._out / FILE, timeout=WAIT_S)  # by default each commit reaches the disk
         try:
             if db.execute("PRAGMA user_version").fetchone()[0] == 0:
-                db.executescript(f"BEGIN; {SCHEMA} PRAGMA user_version = {VERSION}; COMMIT;")
+                create(db)
             require_readable(self._out, db)
             self._require_resumable(db, config)
             stop = config.stop.model_dump_json() if config.stop else None

@@ -218,7 +218,6 @@ def failing_cells(results: Results) -> list[CellResults]:
 
 
 def write_summary(summary: Summary) -> Path:
-    """Write `summary.json` atomically."""
     path = summary.out / FILE
     with whole(path) as part:
         part.write_text(json.dumps(summary.to_json(), indent=2) + "\n")

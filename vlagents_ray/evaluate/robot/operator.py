@@ -11,7 +11,7 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from importlib.resources import files as package_files
 from pathlib import Path
 from typing import Any, Literal, Protocol
@@ -70,9 +70,7 @@ class VisibleTrial:
 
     def to_json(self) -> dict[str, Any]:
         """Return the fields for JSON; for the start pictures, the names of the cameras."""
-        names = ("number", "total", "task", "scene", "attempt", "instruction", "setup", "seconds", "message")
-        fields = {name: getattr(self, name) for name in names}
-        return fields | {"rubric": dict(self.rubric), "start": sorted(self.start)}
+        return asdict(self) | {"rubric": dict(self.rubric), "start": sorted(self.start)}
 
 
 @dataclass(frozen=True, slots=True)
@@ -274,7 +272,15 @@ class PageOperator(Operator):
         listening = socket.create_server(("127.0.0.1", self._port))
         token = secrets.token_urlsafe(24)
         self.url = f"http://127.0.0.1:{listening.getsockname()[1]}/{token}/"
-        app = Starlette(routes=[Mount(f"/{token}", routes=self._routes())])
+        routes = [
+            Route("/", self._file),
+            Route("/{name:str}", self._file),
+            Route("/now/state", self._state),
+            Route("/now/camera/{name:path}", self._camera),
+            Route("/start/{name:path}", self._start),
+            Route("/now/answer", self._take, methods=["POST"]),
+        ]
+        app = Starlette(routes=[Mount(f"/{token}", routes=routes)])
         settings = uvicorn.Config(app, log_config=None, access_log=False, lifespan="off", ws="none")
         self._server = uvicorn.Server(settings)
         self._thread = threading.Thread(
@@ -330,16 +336,6 @@ class PageOperator(Operator):
 
     def _is_watched(self) -> bool:
         return time.monotonic() - self._asked_at < _AWAY_S
-
-    def _routes(self) -> list[Route]:
-        return [
-            Route("/", self._file),
-            Route("/{name:str}", self._file),
-            Route("/now/state", self._state),
-            Route("/now/camera/{name:path}", self._camera),
-            Route("/start/{name:path}", self._start),
-            Route("/now/answer", self._take, methods=["POST"]),
-        ]
 
     async def _file(self, http: Request) -> Response:
         name = http.path_params.get("name", "operator.html")

@@ -106,24 +106,17 @@ class TrialLog(contextlib.AbstractContextManager["TrialLog"]):
         """The trials that have a result, by their number."""
         return {one.trial: one for one in self.attempts if one.finished}
 
-    def next_attempt(self, trial: int) -> int:
-        """Return the number of the next attempt at a trial, from 1."""
-        return 1 + sum(one.trial == trial for one in self.attempts)
-
-    def why_again(self, trial: int) -> str:
-        """Return the reason why a trial is repeated; "" if it has not been played."""
-        return next((one.seen["again"] for one in reversed(self.attempts) if one.trial == trial), "")
+    def of(self, trial: int) -> list[LoggedTrial]:
+        return [one for one in self.attempts if one.trial == trial]
 
     def begin(self, trial: int, attempt: int) -> None:
         """Record that an attempt begins. If no end follows, the evaluation was killed."""
         self._write({"trial": trial, "attempt": attempt, "begun": time.time()})
 
-    def end(self, trial: int, attempt: int, seen: dict[str, Any], sealed: dict[str, Any]) -> LoggedTrial:
-        ended = LoggedTrial(trial, attempt, time.time(), seen, sealed)
-        line = {"trial": trial, "attempt": attempt, "at": ended.at, **seen, "sealed": _seal(self.key, sealed)}
-        self._write(line)
-        self.attempts.append(ended)
-        return ended
+    def end(self, trial: int, attempt: int, seen: dict[str, Any], sealed: dict[str, Any]) -> None:
+        at = time.time()
+        self._write({"trial": trial, "attempt": attempt, "at": at, **seen, "sealed": _seal(self.key, sealed)})
+        self.attempts.append(LoggedTrial(trial, attempt, at, seen, sealed))
 
     def note_unblinded(self) -> None:
         """Record that the results were written before all trials were played."""
@@ -341,8 +334,8 @@ class _RemainingTrials:
                 self._play(trial)
 
     def _play(self, trial: Trial) -> None:
-        attempt = self._log.next_attempt(trial.number)
-        view = self._visible(trial, attempt)
+        view = self._visible(trial)
+        attempt = view.attempt
         if not self._operator.prepare(view, self._robot.observe):
             raise KeyboardInterrupt
         if all(self._trials[number - 1].place != trial.place for number in self._log.finished):
@@ -397,20 +390,20 @@ class _RemainingTrials:
         stopping = self._stopping.get(trial.task)
         return stopping is not None and all(one.at is not None for one in stopping.values())
 
-    def _visible(self, trial: Trial, attempt: int) -> VisibleTrial:
-        (robot, task), again = trial.job.cell.on_robot, self._log.why_again(trial.number)
+    def _visible(self, trial: Trial) -> VisibleTrial:
+        (robot, task), earlier = trial.job.cell.on_robot, self._log.of(trial.number)
         return VisibleTrial(
             number=trial.number,
             total=len(self._trials),
             task=" ".join(filter(None, trial.task)),
             scene=trial.scene,
-            attempt=attempt,
+            attempt=len(earlier) + 1,
             instruction=task.instruction,
             setup=task.setup,
             seconds=task.max_steps / robot.hz,
             rubric=task.rubric,
             start=start_pictures(self._config.out, trial.place),
-            message=f"played again: {again}" if again else self._message,
+            message=f"played again: {earlier[-1].seen['again']}" if earlier else self._message,
         )
 
     def _require_same_policy(self, trial: Trial, played: PlayedTrial) -> None:

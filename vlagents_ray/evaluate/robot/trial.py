@@ -161,7 +161,7 @@ def play(
     cell = trial.job.cell
     settings, task = cell.on_robot
     deadline_s = _deadline_s(settings)
-    stats = robot.stats = EpisodeStats(trial.job.key, instruction=task.instruction)
+    stats = robot.stats = EpisodeStats(trial.job.key, instructions=[task.instruction])
     watchdog = Watchdog(
         lambda _: robot.stop(), {"server": settings.silent_s, "loop": max(0.2, 5 / settings.hz) + deadline_s}
     )

@@ -134,7 +134,6 @@ class FailedAttempts:
         self._lost = self._policy_errors = 0
 
     def note_policy_error(self, error: str) -> None:
-        """Note that an error of the policy ended an episode."""
         self._policy_errors += 1
         if self._policy_errors == self._config.abort_after:
             raise PolicyFailed(

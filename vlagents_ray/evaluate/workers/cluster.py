@@ -178,11 +178,9 @@ def tail_at(host: str, paths: Sequence[str]) -> str:
         return ""
     there = NodeAffinitySchedulingStrategy(nodes[0], soft=False)
     try:
-        read: str = ray.get(
-            ray.remote(tail).options(num_cpus=0, scheduling_strategy=there).remote(list(paths)), timeout=TIMEOUT_S
-        )
+        read = ray.remote(tail).options(num_cpus=0, scheduling_strategy=there).remote(list(paths))
+        return str(ray.get(read, timeout=TIMEOUT_S))
     except GetTimeoutError:
         raise TimeoutError(f"host {host} did not answer within {TIMEOUT_S:g} s") from None
     except RayError:  # the node is gone with its files
         return ""
-    return read

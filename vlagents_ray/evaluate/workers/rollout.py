@@ -169,9 +169,10 @@ class Rollout:
                 agent,
                 self._sessions_of(agent, env, len(jobs)),
                 [job.key for job in jobs],
-                episode.EpisodeSettings(
-                    cell.policy.execute, cell.suite.clock, cell.suite.reset_options, cell.policy_options
-                ),
+                execute=cell.policy.execute,
+                clock=cell.suite.clock,
+                reset_options=cell.suite.reset_options,
+                policy_options=cell.policy_options,
                 observers=recordings,
                 watch=self._set_phase,
                 images=wanted == "all" or (wanted == "failures" and self._renders_at_once(agent, env, cell.policy)),
