@@ -161,11 +161,11 @@ def _run(options: argparse.Namespace) -> LoopReport:
         )  # fmt: skip
         if report.outcome:
             say(f"marked as a {report.outcome} on the live page")
-        say(_line(_HEADER))
         jitter = report.jitter
         numbers = [f"{jitter['ticks']:.0f}", f"{jitter['missed']:.0f}", f"{100 * jitter['on_time']:.2f} %"]
         times = (f"{jitter[key]:.3f}" for key in ("p50_ms", "p99_ms", "max_ms"))
-        say(_line((f"{options.mode}, {agent.transport}", *numbers, *times)))
+        for first, *cells in (_HEADER, (f"{options.mode}, {agent.transport}", *numbers, *times)):
+            say(f"{first:<20}" + "".join(f"{cell:>13}" for cell in cells))
         _say_outcome(report, say, led=leader is not None)
     if recorder is not None:  # closed: everything is written
         say(f"recorded: {recorder.episodes} episodes in {options.record}, {recorder.dropped} frames dropped")
@@ -329,7 +329,3 @@ def command_parser() -> tuple[argparse.ArgumentParser, list[argparse.Action], li
     simulated("--episodes", type=rows, default=10, metavar="N", help="how many (%(default)s)")
     simulated("--seed", type=int, default=0, help="of the first episode; the others count on (%(default)s)")
     return parser, of_robot, of_env
-
-
-def _line(cells: Sequence[str]) -> str:
-    return f"{cells[0]:<20}" + "".join(f"{cell:>13}" for cell in cells[1:])

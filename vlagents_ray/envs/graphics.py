@@ -75,17 +75,17 @@ class _Functions:
         handles, number = (ctypes.c_void_p * _MOST)(), ctypes.c_int()
         if not self._query(_MOST, handles, ctypes.byref(number)):
             return []
-        return [(handles[i], self._device(i, handles[i])) for i in range(number.value)]
+        found = []
+        for i, handle in enumerate(handles[: number.value]):
+            extensions = (self._text(handle, _EXTENSIONS) or b"").decode().split()
+            cuda = self.value(self._attribute, handle, _CUDA_DEVICE) if _CUDA in extensions else None
+            found.append((handle, EglDevice(i, _SOFTWARE in extensions, cuda)))
+        return found
 
     def value(self, ask: Callable[..., int], of: int | None, what: int) -> int | None:
         """Return the value of an attribute; None if it has no value."""
         found = _Value(-1)
         return found.value if ask(of, what, ctypes.byref(found)) and found.value >= 0 else None
-
-    def _device(self, number: int, handle: int | None) -> EglDevice:
-        extensions = (self._text(handle, _EXTENSIONS) or b"").decode().split()
-        cuda = self.value(self._attribute, handle, _CUDA_DEVICE) if _CUDA in extensions else None
-        return EglDevice(number, _SOFTWARE in extensions, cuda)
 
     def _extension(self, name: str, result: Any, *arguments: Any) -> Any:
         if not (address := self.library.eglGetProcAddress(name.encode())):
@@ -245,7 +245,6 @@ _BOX_XML = """
 class RenderProbe:
     """The outcome of rendering one frame."""
 
-    api: Literal["vulkan", "egl"]
     ok: bool
     seconds: float  # the child's run time, imports included
     device: str | None = None  # the driver's name of the device; "llvmpipe ..." is Mesa's software driver
@@ -302,17 +301,14 @@ def _probed(api: Literal["vulkan", "egl"], module: str, extra: str, cure: str, t
     """Render one frame in a child process with `module`, which the extra `extra` installs."""
     if importlib.util.find_spec(module) is None:
         error, cure = f"{module} is not installed", f"pip install 'vlagents-ray[{extra}]'"
-        return RenderProbe(api, ok=False, seconds=0.0, error=error, cure=cure)
+        return RenderProbe(ok=False, seconds=0.0, error=error, cure=cure)
     root = str(Path(vlagents_ray.__file__).parents[1])
     path = os.pathsep.join(filter(None, [root, os.environ.get("PYTHONPATH")]))
-    variables = {**os.environ, "PYTHONPATH": path}
-    if api == "egl":
-        variables["MUJOCO_GL"] = "egl"
     started = time.monotonic()
     try:
         child = subprocess.run(  # noqa: S603 - our own interpreter and module, no outside input
             [sys.executable, "-c", f"from {__name__} import _main; _main({api!r})"],
-            env=variables,
+            env={**os.environ, "PYTHONPATH": path, "MUJOCO_GL": "egl"},  # which SAPIEN does not read
             stdin=subprocess.DEVNULL,
             capture_output=True,
             text=True,
@@ -322,15 +318,15 @@ def _probed(api: Literal["vulkan", "egl"], module: str, extra: str, cure: str, t
         )
     except subprocess.TimeoutExpired:
         error = f"no frame within {timeout_s:g} s"
-        return RenderProbe(api, ok=False, seconds=time.monotonic() - started, error=error, cure=cure)
+        return RenderProbe(ok=False, seconds=time.monotonic() - started, error=error, cure=cure)
     seconds = time.monotonic() - started
     if child.returncode == 0:
         answer = json.loads(child.stdout.splitlines()[-1])
         devices = tuple(EglDevice(**one) for one in answer["devices"])
-        return RenderProbe(api, ok=True, seconds=seconds, device=answer["device"], devices=devices)
+        return RenderProbe(ok=True, seconds=seconds, device=answer["device"], devices=devices)
     errors = [line for line in child.stderr.splitlines() if line.strip()]
     ended = f"the child ended with {child.returncode}"
-    return RenderProbe(api, ok=False, seconds=seconds, error=errors[-1].strip() if errors else ended, cure=cure)
+    return RenderProbe(ok=False, seconds=seconds, error=errors[-1].strip() if errors else ended, cure=cure)
 
 
 def _render_vulkan() -> str | None:
