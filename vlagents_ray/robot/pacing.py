@@ -31,14 +31,13 @@ class Pacer:
     A tick that is over before it could begin is skipped and counted as missed.
     """
 
-    def __init__(self, hz: float, spin_s: float = SPIN_S) -> None:
+    def __init__(self, hz: float) -> None:
         if not (math.isfinite(hz) and hz > 0):
             raise ConfigError(f"hz: got {hz}, want a rate above 0")
         self.period_s = 1.0 / hz
         self.missed = 0
         self.ticks = 0  # ticks that began
         self.late_s: deque[float] = deque(maxlen=KEPT_TICKS)  # lateness of the last ticks that began
-        self._spin_s = spin_s
         self._begin = time.perf_counter()
         self._tick = -1
 
@@ -51,8 +50,8 @@ class Pacer:
             self._tick += behind
             self.missed += behind
         due = self._begin + self._tick * self.period_s
-        if due - now > self._spin_s:
-            time.sleep(due - now - self._spin_s)
+        if due - now > SPIN_S:
+            time.sleep(due - now - SPIN_S)
         while (now := time.perf_counter()) < due:
             time.sleep(0)  # lets other threads have the interpreter and the core
         self.late_s.append(now - due)

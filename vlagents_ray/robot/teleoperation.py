@@ -107,7 +107,13 @@ class AxesLeader:
         moved = np.zeros(self._dim, np.float32)
         n = min(self._dim - gripper, len(axes))
         moved[:n] = self._step * axes[:n]
-        command = self._gripper(obs) if gripper else None
+        command = None
+        if gripper:
+            if self._closed is None:
+                self._closed = obs.gripper is not None and obs.gripper < _FULLY_OPEN
+            if self._device.gripper_presses() % 2:
+                self._closed = not self._closed
+            command = float((spec.gripper_closed if self._closed else spec.gripper_open) or 0.0)
         if not spec.relative:
             if self._target is None and self._measure is not None:
                 self._target = np.array(self._measure(obs), np.float32)
@@ -122,13 +128,6 @@ class AxesLeader:
         if command is not None:
             moved[-1] = command
         return moved.astype(np.float32)
-
-    def _gripper(self, obs: Obs) -> float:
-        if self._closed is None:
-            self._closed = obs.gripper is not None and obs.gripper < _FULLY_OPEN
-        if self._device.gripper_presses() % 2:
-            self._closed = not self._closed
-        return float((self._spec.gripper_closed if self._closed else self._spec.gripper_open) or 0.0)
 
 
 # A keyboard as a device with axes, read from the terminal so that it also works over SSH.
