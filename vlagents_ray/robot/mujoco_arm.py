@@ -195,7 +195,6 @@ class MujocoArm:
         self._goal = self._target = np.array(held)
 
     def close(self) -> None:
-        """Close the renderer."""
         if self._renderer is not None:
             self._renderer.close()
             self._renderer = None
@@ -274,7 +273,9 @@ class MujocoArm:
         self._flat = [drive for drives in self._drives for drive in drives]
         if not all(any(not drive.gripper for drive in drives) for drives in self._drives):
             raise ConfigError(f"{stated.menagerie}: got an arm without joints that move, want the file of an arm")
-        self._hands = [self._hand(drives) for drives in self._drives]
+        last = [[drive for drive in drives if not drive.gripper][-1] for drives in self._drives]
+        joints = [int(self.model.actuator_trnid[drive.actuators[0], 0]) for drive in last]
+        self._hands = [int(self.model.jnt_bodyid[joint]) for joint in joints]
         self._bases = [int(self.model.body_rootid[hand]) for hand in self._hands]
         self._rest(stated)
 
@@ -356,10 +357,6 @@ class MujocoArm:
                 arms[number].append(drive)
             drive.actuators.append(index)
         return [[*drives, *([grip] if grip.actuators else [])] for drives, grip in zip(arms, grippers, strict=True)]
-
-    def _hand(self, drives: Sequence[_Drive]) -> int:
-        last = [drive for drive in drives if not drive.gripper][-1]
-        return int(self.model.jnt_bodyid[int(self.model.actuator_trnid[last.actuators[0], 0])])
 
     def _pose(self, body: int) -> tuple[np.ndarray, np.ndarray]:
         return self.data.xpos[body], self.data.xmat[body].reshape(3, 3)
