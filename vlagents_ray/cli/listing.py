@@ -24,8 +24,6 @@ _SHORT = 5  # most ranges of tasks that a line of the listing names
 
 @dataclass(frozen=True)
 class Listed:
-    """A line of a listing."""
-
     kind: str  # "policy", "wrapper" or "environment"
     name: str  # as registered
     what: str  # a description, or an environment's tasks, in one line

@@ -42,8 +42,6 @@ _Value = ctypes.c_ssize_t  # EGLAttrib
 
 @dataclass(frozen=True, slots=True)
 class EglDevice:
-    """A device of EGL."""
-
     number: int  # in EGL's own order, as in MUJOCO_EGL_DEVICE_ID
     software: bool
     cuda: int | None  # its number among the CUDA devices that this process may use; None if CUDA does not know it

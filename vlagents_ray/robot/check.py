@@ -105,8 +105,6 @@ class Finding:
 
 @dataclass
 class RobotReport:
-    """The outcome of a check of a robot."""
-
     findings: list[Finding] = field(default_factory=list)
     passed: list[str] = field(default_factory=list)  # keys of CHECKS
     skipped: dict[str, str] = field(default_factory=dict)  # check: the reason

@@ -83,7 +83,6 @@ class Dataset:
 
     @property
     def episodes(self) -> int:
-        """The number of episodes."""
         return int(self.info["total_episodes"])
 
     def begin(self, instruction: str, meaning: ActionSpec | None = None) -> RobotEpisode:
@@ -105,7 +104,6 @@ class Dataset:
         )
 
     def save(self, episode: Finished) -> None:
-        """Add an episode to the dataset."""
         number, frames = self.episodes, len(episode.rows[ACTION])
         place = _place(number)
         first = int(self.info["total_frames"])

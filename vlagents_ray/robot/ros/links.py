@@ -76,7 +76,6 @@ class Ros2:
         return True
 
     def close(self) -> None:
-        """End the node, and its thread."""
         self._context.try_shutdown()
         if self._thread is not None:
             self._thread.join()
@@ -176,7 +175,6 @@ class Rosbridge:
         return True
 
     def close(self) -> None:
-        """Close the connection, and end the thread."""
         self._closing.set()
         socket, self._socket = self._socket, None
         if socket is not None:
