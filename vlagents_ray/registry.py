@@ -1,9 +1,8 @@
 """Names of policies, environments and dialects, the location of their code, and their requirements.
 
-A name refers to `"module:Class"`, imported only when it is used. Third parties add names through the entry-point
-groups `vlagents_ray.policies`, `vlagents_ray.wrappers`, `vlagents_ray.envs` and `vlagents_ray.dialects`; a
-`"module:Class"` in a deployment file works without registration. Wrappers change the observations of any policy, or
-its actions.
+A name refers to `"module:Class"`, imported only when it is used. Third parties add names through the entry-point groups
+`vlagents_ray.policies`, `vlagents_ray.wrappers`, `vlagents_ray.envs` and `vlagents_ray.dialects`; a `"module:Class"` in
+a deployment file works without registration. Wrappers change the observations of any policy, or its actions.
 
 The tables of README and docs/ are made from this file: `python tests/support/tables.py`.
 """

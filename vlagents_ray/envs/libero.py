@@ -213,9 +213,8 @@ class Libero(SimulatorEnv):
     `info["sim_state"]`, for scripted experts only: `positions` of objects and of the goal's regions, (3,) m in the
     world frame; `quaternions` of objects, (4,) xyzw; the predicates of the `goal`, and those of them that are `unmet`.
 
-    Action: (7,) in [-1, 1]: the end effector's target moves by 0.05 m per unit along the base's axes, and
-    turns by 0.5 rad per unit about them, axis-angle; the last is the gripper: -1 opens, 1 closes, and only
-    its sign counts.
+    Action: (7,) in [-1, 1]: the end effector's target moves by 0.05 m per unit along the base's axes, and turns by 0.5
+    rad per unit about them, axis-angle; the last is the gripper: -1 opens, 1 closes, and only its sign counts.
 
     An episode is a pure function of its initial state, `options["init_state"]`. Without that option the seed
     selects the state; otherwise only the policy uses the seed.

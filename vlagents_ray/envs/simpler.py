@@ -68,9 +68,8 @@ class Simpler(SimulatorEnv):
     its change of roll, pitch and yaw in rad, and the gripper, 1 open, 0 closed. It is relative to the last command, not
     to the measured pose. As in SIMPLER's script, the controller reads the rotation as the numbers of a rotation vector.
 
-    The initial state is `options["init_state"]`, SIMPLER's episode id; without it the seed modulo
-    `init_states`. The seed has no other effect. The env continues after success, and never reports
-    `terminated`.
+    The initial state is `options["init_state"]`, SIMPLER's episode id; without it the seed modulo `init_states`. The
+    seed has no other effect. The env continues after success, and never reports `terminated`.
     """
 
     suite, known = "simpler", tuple(TWINS)
