@@ -36,7 +36,7 @@ class PlainConsole(Console):
     def size(self) -> ConsoleDimensions:
         """The size in columns and lines; a file or a pipe is unbounded."""
         size = super().size
-        return size if self.is_terminal else size._replace(width=_UNBOUNDED)
+        return size if self.is_terminal else size._replace(width=10_000)
 
 
 def table(*columns: str, **options: Any) -> Table:
@@ -47,7 +47,6 @@ def table(*columns: str, **options: Any) -> Table:
     return made
 
 
-_UNBOUNDED = 10_000  # columns
 out = PlainConsole()
 err = PlainConsole(stderr=True)
 

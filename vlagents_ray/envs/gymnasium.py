@@ -24,7 +24,6 @@ from vlagents_ray.interface import Act, Obs
 from vlagents_ray.naming import did_you_mean
 from vlagents_ray.registry import require
 
-TERMINATED = "terminated"
 SUCCESS_KEYS = ("is_success", "success")
 RENDER = "render"  # in place of a path: the image of the environment's own renderer
 _PATH = re.compile(r"(?P<keys>[^\[\]]*?)(?:\[(?P<start>-?\d*):(?P<stop>-?\d*)\])?")
@@ -227,7 +226,7 @@ class Gymnasium(EvalEnv):
         action = np.clip(action, self._low, self._high).astype(self._dtype)
         nested, reward, terminated, truncated, info = self._call("step", action)
         self._steps += 1
-        if self._success == TERMINATED:
+        if self._success == "terminated":
             success = bool(terminated)
         elif self._success is not None:
             success = bool(Pick.parse(self._success).value(info))

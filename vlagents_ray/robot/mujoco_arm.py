@@ -39,12 +39,10 @@ class ArmModel:
     arms: tuple[str, ...] = ()  # the names of several arms, in the order of the file
 
 
-_PANDA = (0.0, -0.3, 0.0, -1.9, 0.0, 1.6, 0.8)
-_ALOHA = (0.0, -0.96, 1.16, 0.0, -0.3, 0.0)
 ARMS = {
     "so101": ArmModel("robotstudio_so101", rest=(0.2, -0.6, 0.5, 0.8, 0.1)),
-    "franka": ArmModel("franka_emika_panda", rest=_PANDA),
-    "aloha": ArmModel("aloha", rest=2 * _ALOHA, arms=("left", "right")),
+    "franka": ArmModel("franka_emika_panda", rest=(0.0, -0.3, 0.0, -1.9, 0.0, 1.6, 0.8)),
+    "aloha": ArmModel("aloha", rest=2 * (0.0, -0.96, 1.16, 0.0, -0.3, 0.0), arms=("left", "right")),
     "ur5e": ArmModel("universal_robots_ur5e"),
     "xarm7": ArmModel("ufactory_xarm7", rest=(0.0, -0.25, 0.0, 0.9, 0.0, 1.1, 0.0), open_high=False),
 }

@@ -18,7 +18,6 @@ from vlagents_ray.errors import ConfigError
 
 SPIN_S = 0.001
 """The last part of a wait, s, in which the thread spins: a sleeping thread wakes tens of microseconds late or more."""
-ON_TIME_S = 0.002
 KEPT_TICKS = 200_000  # the number of ticks whose lateness is kept, as a loop may run for days
 _SWITCH_S = 0.0005  # longest time for which another thread keeps the interpreter; Python's default is 5 ms
 _NICE = -10
@@ -80,7 +79,7 @@ def jitter(late_s: Sequence[float], missed: int, ticks: int | None = None) -> di
     return {
         "ticks": ticks,
         "missed": missed,
-        "on_time": float((late_ms <= ON_TIME_S * 1e3).mean()) * ticks / max(1, ticks + missed),
+        "on_time": float((late_ms <= 2).mean()) * ticks / max(1, ticks + missed),
         "p50_ms": float(np.median(late_ms)),
         "p99_ms": float(np.quantile(late_ms, 0.99)),
         "max_ms": float(late_ms.max()),

@@ -23,7 +23,6 @@ from vlagents_ray.registry import require
 __all__ = ["AxesDevice", "AxesLeader", "Keyboard", "Leader", "SpaceMouse", "TeleoperatedAgent"]
 
 _FULLY_OPEN = 0.9  # below this opening, a gripper may hold something
-_SPEED = 0.5
 
 
 class AxesDevice(ABC):
@@ -79,7 +78,7 @@ class AxesLeader:
                 "teleoperation: the contract states no action.dim, or not whether actions are relative; want both"
             )
         if step is None and spec.relative and spec.low is not None and spec.high is not None:
-            step = _SPEED * min(abs(spec.low), abs(spec.high))
+            step = min(abs(spec.low), abs(spec.high)) / 2
         if step is None or not step > 0:
             raise ConfigError(
                 f"step: got {step}, want the change of a number at a tick, above 0; the contract has no bounds of "
@@ -283,7 +282,6 @@ class TeleoperatedAgent(Agent):
 
 # The only reader of the terminal, so that each typed key has exactly one consumer.
 
-_POLL_S = 0.1
 Consumer = Callable[[str], bool]  # gets a key in lower case; returns whether it has a meaning for that key
 
 
@@ -355,7 +353,7 @@ class Terminal:
         over = threading.Event()
 
         def read() -> None:
-            while self.read(consumer) and not over.wait(_POLL_S):
+            while self.read(consumer) and not over.wait(0.1):
                 pass
 
         thread = threading.Thread(target=read, name="vlagents-ray-terminal", daemon=True)
