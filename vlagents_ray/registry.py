@@ -12,7 +12,6 @@ from __future__ import annotations
 import functools
 import importlib
 import sys
-from collections.abc import Iterator
 from dataclasses import dataclass
 from importlib.metadata import entry_points
 from pathlib import Path
@@ -289,13 +288,6 @@ _BROUGHT = {"torchvision": "torch", "tokenizers": "transformers", "safetensors":
 }
 
 
-def families() -> Iterator[tuple[str, Adapter]]:
-    """Yield the policies that need a Python environment of their own, with their names."""
-    for name, one in POLICIES.items():
-        if one.requirements:
-            yield name, one
-
-
 def require(module: str, *, extra: str | None = None) -> ModuleType:
     """Import an optional module.
 
@@ -329,7 +321,8 @@ def _install(package: str, extra: str | None = None) -> str:
             f"workers that environment's Python, `runtime_env: {{py_executable: ...}}`"
         )
     needed = _BROUGHT.get(package, package)
-    if files := sorted({f"{one.requirements[0]}.txt" for _, one in families() if needed in one.needs}):
+    families = [one for one in POLICIES.values() if one.requirements and needed in one.needs]
+    if files := sorted({f"{one.requirements[0]}.txt" for one in families}):
         family = f"; FILE is that of the policy's family: {', '.join(files)}" if len(files) > 1 else ""
         return (
             f"run `vlagents-ray env make requirements/{'FILE' if family else files[0]}` and name the environment in "

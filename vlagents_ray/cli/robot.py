@@ -45,14 +45,13 @@ RESTART_KEYS = "c\n"  # without Enter while the keyboard moves the robot
 _HEADER = ("", "ticks", "missed", "within 2 ms", "p50 ms", "p99 ms", "max ms")
 
 
-def main(arguments: Sequence[str] | None = None) -> int:
+def main(arguments: Sequence[str]) -> int:
     """Run the command, and return its exit status."""
-    given = sys.argv[1:] if arguments is None else arguments
-    if given[:1] == ["check"]:
+    if arguments[:1] == ["check"]:
         from vlagents_ray.cli.robot_check import main as check
 
-        return check(given[1:])
-    options = parse(given)
+        return check(arguments[1:])
+    options = parse(arguments)
     if options.env is not None:
         from vlagents_ray.cli.simulated_robot import drive
 
@@ -68,7 +67,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     return 1 if report.safe_ticks else 0
 
 
-def parse(arguments: Sequence[str] | None = None) -> argparse.Namespace:
+def parse(arguments: Sequence[str]) -> argparse.Namespace:
     """Parse the arguments; the process ends with status 2 if they are inconsistent."""
     parser, of_robot, of_env = command_parser()
     options = parser.parse_args(arguments)
