@@ -13,6 +13,7 @@ that loads it. Their results are cached for the life of the process.
 
 from __future__ import annotations
 
+import contextlib
 import ctypes
 import functools
 import importlib.util
@@ -163,9 +164,7 @@ def choose_devices() -> None:
 
 def opengl_renderer() -> Renderer | None:
     """Return the renderer of this thread's OpenGL context; None if there is none, or if it is not EGL's."""
-    functions = _functions()
-    display = None if functions is None else functions.library.eglGetCurrentDisplay()
-    if functions is None or not display:
+    if (functions := _functions()) is None or not (display := functions.library.eglGetCurrentDisplay()):
         return None
     handle = functions.value(functions.display_attribute, display, _DEVICE)
     device = next((device for pointer, device in functions.devices() if pointer == handle), None)
@@ -357,13 +356,10 @@ def _render_egl() -> str | None:
     model = mujoco.MjModel.from_xml_string(_BOX_XML)
     data = mujoco.MjData(model)
     mujoco.mj_forward(model, data)
-    renderer = mujoco.Renderer(model, 64, 64)
-    try:
+    with contextlib.closing(mujoco.Renderer(model, 64, 64)) as renderer:
         renderer.update_scene(data, camera="front")
         _require_contrast(np.asarray(renderer.render()))
         name = glGetString(GL_RENDERER)
-    finally:
-        renderer.close()
     return name.decode() if isinstance(name, bytes) else None
 
 

@@ -93,14 +93,9 @@ class Dataset:
         unfinished = self.root / UNFINISHED
         unfinished.mkdir(parents=True, exist_ok=True)
         folder = Path(tempfile.mkdtemp(dir=unfinished))
+        meaning = meaning or ActionSpec()
         return RobotEpisode(
-            folder,
-            instruction,
-            self.info["fps"],
-            self.info["features"],
-            self.interventions,
-            self._lossless,
-            meaning or ActionSpec(),
+            folder, instruction, self.info["fps"], self.info["features"], self.interventions, self._lossless, meaning
         )
 
     def save(self, episode: Finished) -> None:
