@@ -280,9 +280,8 @@ def vulkan_device(*, on_gpu: bool) -> tuple[str, int | None] | None:
 def usable_devices(summary: str) -> list[tuple[str, int | None]]:
     """List the devices that SAPIEN's `summary` calls supported, in its order.
 
-    Returns:
-        For each device its name, such as "llvmpipe (LLVM 15.0.6, 256 bits)", and its number among the CUDA devices of
-        this process; None if CUDA does not know it.
+    Each has a name, such as "llvmpipe (LLVM 15.0.6, 256 bits)", and its number among the CUDA devices of this process;
+    None if CUDA does not know it.
     """
     found = []
     for block in summary.split("GPU:")[1:]:

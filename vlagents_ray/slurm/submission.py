@@ -42,11 +42,7 @@ _SBATCH_S = 120.0
 
 
 def split(words: Sequence[str], known: Mapping[str, bool]) -> tuple[list[str], dict[str, str | None]]:
-    """Split a command line.
-
-    Returns:
-        The command's own arguments, and sbatch's options by their long names, with None for options without a value.
-    """
+    """Return a command's own arguments, and sbatch's options by their long names, None for those without a value."""
     own: list[str] = []
     sbatch: dict[str, str | None] = {}
     waiting = iter(words)
@@ -154,11 +150,7 @@ class SubmissionFailed(VLAgentsError):
 
 
 def submit(script: Script) -> str:
-    """Write a script, and submit it.
-
-    Returns:
-        The job's number.
-    """
+    """Write a script, submit it, and return the job's number."""
     file = script.file.absolute()
     file.parent.mkdir(parents=True, exist_ok=True)
     file.write_text(script.text())
