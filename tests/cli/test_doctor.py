@@ -210,7 +210,7 @@ def test_a_machine_on_which_workers_without_a_gpu_could_not_render_is_told(
     monkeypatch: pytest.MonkeyPatch, software: bool, status: str
 ) -> None:
     devices = (EglDevice(0, software=False, cuda=0), *([EglDevice(1, software=True, cuda=None)] if software else []))
-    found = graphics.RenderProbe("egl", ok=True, seconds=1.0, device="NVIDIA H200/PCIe/SSE2", devices=devices)
+    found = graphics.RenderProbe(ok=True, seconds=1.0, device="NVIDIA H200/PCIe/SSE2", devices=devices)
     monkeypatch.setattr(graphics, "egl_probe", lambda: found)
     row = doctor.egl()
     assert row.status == status

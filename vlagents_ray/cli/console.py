@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import itertools
 import json
 import os
 import sys
@@ -35,7 +36,7 @@ class PlainConsole(Console):
     def size(self) -> ConsoleDimensions:
         """The size in columns and lines; a file or a pipe is unbounded."""
         size = super().size
-        return size if self.is_terminal else size._replace(width=_UNBOUNDED)
+        return size if self.is_terminal else size._replace(width=10_000)
 
 
 def table(*columns: str, **options: Any) -> Table:
@@ -46,7 +47,6 @@ def table(*columns: str, **options: Any) -> Table:
     return made
 
 
-_UNBOUNDED = 10_000  # columns
 out = PlainConsole()
 err = PlainConsole(stderr=True)
 
@@ -94,11 +94,8 @@ def say_error(message: str, console: Console | None = None) -> None:
 
 def fresh(folder: Path) -> Path:
     """Return `folder`, or the first of folder-2, folder-3, … that does not exist, so that results never mix."""
-    candidate, number = folder, 1
-    while candidate.exists():
-        number += 1
-        candidate = folder.with_name(f"{folder.name}-{number}")
-    return candidate
+    numbered = (folder.with_name(f"{folder.name}-{number}") for number in itertools.count(2))
+    return next(one for one in itertools.chain([folder], numbered) if not one.exists())
 
 
 def print_json(document: Any) -> None:

@@ -77,9 +77,6 @@ def shown_progress(config: EvalConfig, live: tuple[str, int] | None, *, goes_on:
     """Show an evaluation on the terminal and, if that has an address, on the live page, within the context of its Ray.
 
     Without workers the terminal shows lines: a table that is drawn again would disturb a debugger.
-
-    Yields:
-        The progress to evaluate with.
     """
     progress = progress_for(out) if config.workers else LineProgress(out)
     if live is None:

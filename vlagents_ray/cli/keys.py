@@ -20,7 +20,6 @@ File = Annotated[
     Path | None, typer.Option("--keys", help=f"The key file; default: {FILE_VARIABLE}, or keys.json in this folder.")
 ]
 Name = Annotated[str, typer.Argument(help="Who has the key: arm-1, lab, …")]
-_DAY_S = 86_400
 
 
 @keys.command("new")
@@ -39,7 +38,7 @@ def new(
 ) -> None:
     """Make a key. It is shown this once; the file keeps its hash."""
     with errors():
-        expires = None if days is None else time.time() + days * _DAY_S
+        expires = None if days is None else time.time() + days * 86_400
         place = _file(file)
         allowed = {"apps": tuple(app), "rate": rate, "sessions": sessions, "rank": rank, "scopes": tuple(scope)}
         token = new_key(place, name, expires=expires, **allowed)

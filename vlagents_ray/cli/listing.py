@@ -13,7 +13,7 @@ from itertools import groupby
 from typing import TYPE_CHECKING, Any
 
 from vlagents_ray.errors import MissingDependency, VLAgentsError
-from vlagents_ray.registry import POLICIES, env_class, families, names, policy_class, wrapper_class
+from vlagents_ray.registry import POLICIES, env_class, names, policy_class, wrapper_class
 
 if TYPE_CHECKING:
     from vlagents_ray.serve.launch.deployment_file import Deployment
@@ -24,8 +24,6 @@ _SHORT = 5  # most ranges of tasks that a line of the listing names
 
 @dataclass(frozen=True)
 class Listed:
-    """A line of a listing."""
-
     kind: str  # "policy", "wrapper" or "environment"
     name: str  # as registered
     what: str  # a description, or an environment's tasks, in one line
@@ -111,7 +109,7 @@ def missing_packages(name: str, *, checkout: bool = True) -> str | None:
 
 def _lacking(name: str) -> tuple[list[str], list[str], str]:
     """Return the modules and checkout variables that a family lacks, and its requirements file."""
-    if (one := dict(families()).get(name)) is None:
+    if (one := POLICIES.get(name)) is None or not one.requirements:
         return [], [], ""
     given = any(os.environ.get(variable) for variable in one.checkouts)
     lacking = [module for module in one.needs[given:] if importlib.util.find_spec(module) is None]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import datetime
 import functools
@@ -107,10 +108,8 @@ def parse_list(text: str) -> list[str]:
 
 def parse_time(text: str, option: str) -> float:
     """Parse seconds since 1970, or a date and time of day (local unless it has a zone), to seconds since 1970."""
-    try:
+    with contextlib.suppress(ValueError):
         return float(text)
-    except ValueError:
-        pass
     try:
         return datetime.datetime.fromisoformat(text).timestamp()
     except ValueError as error:

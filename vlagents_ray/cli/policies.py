@@ -154,11 +154,7 @@ def _local_policies(parts: Mapping[str, Deployment], workers: int | None) -> dic
 
 
 def resolve_policies(config: EvalConfig, *, ask: bool = True) -> tuple[EvalConfig, dict[str, Deployment]]:
-    """Find the names, URLs and deployments of the policies of an evaluation.
-
-    Returns:
-        The evaluation with names and URLs of its policies; and the deployments to start for it, by application.
-    """
+    """Return the evaluation with names and URLs of its policies, and the deployments to start, by application."""
     parts: dict[str, Deployment] = {}
     policies = [_resolve_policy(policy, parts, ask=ask) for policy in config.policies]
     return type(config).model_validate(config.model_dump(exclude_unset=True) | {"policies": policies}), parts

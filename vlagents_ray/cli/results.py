@@ -197,13 +197,11 @@ def replay_command(
                 raise ConfigError(f"{folder}: is a dataset: want --policy, a name, a deployment file or a URL")
             from vlagents_ray.open_loop import Names, ReplayPlan
 
-            chosen = None if only is None else parse_episodes(only)
             pairs = [part.partition("=") for part in parse_list(camera_map or "")]
             if odd := [name for name, equals, _ in pairs if not equals]:
                 raise ConfigError(f"--camera-map: got {odd[0]!r}, want POLICY=DATASET, such as base=top,wrist=left")
-            renamed = {name: camera for name, _, camera in pairs}
-            names = Names(renamed, None if state is None else parse_list(state))
-            plan = ReplayPlan(chosen, horizon, every, at_once, names)
+            names = Names({name: camera for name, _, camera in pairs}, None if state is None else parse_list(state))
+            plan = ReplayPlan(None if only is None else parse_episodes(only), horizon, every, at_once, names)
             replay_dataset(folder, policy, out_dir or fresh(Path("runs/replay")), plan)
             return
         if episode is None:
@@ -219,9 +217,8 @@ def replay_command(
         into = out_dir or fresh(folder / "replays" / "replay")
         summary = play_one(recorded.config(into, policy=other), address, recorded.number_and_seed)
         found = compare(recorded, summary.results)
-        steps = recorded.episode.result.steps
-        lines = found or [f"the same: {steps} actions byte for byte, and what came of them"]
-        for line in [*lines, f"replay: {into}"]:
+        same = f"the same: {recorded.episode.result.steps} actions byte for byte, and what came of them"
+        for line in [*(found or [same]), f"replay: {into}"]:
             out.print(line)
     raise typer.Exit(bool(found))
 

@@ -45,14 +45,13 @@ RESTART_KEYS = "c\n"  # without Enter while the keyboard moves the robot
 _HEADER = ("", "ticks", "missed", "within 2 ms", "p50 ms", "p99 ms", "max ms")
 
 
-def main(arguments: Sequence[str] | None = None) -> int:
+def main(arguments: Sequence[str]) -> int:
     """Run the command, and return its exit status."""
-    given = sys.argv[1:] if arguments is None else arguments
-    if given[:1] == ["check"]:
+    if arguments[:1] == ["check"]:
         from vlagents_ray.cli.robot_check import main as check
 
-        return check(given[1:])
-    options = parse(given)
+        return check(arguments[1:])
+    options = parse(arguments)
     if options.env is not None:
         from vlagents_ray.cli.simulated_robot import drive
 
@@ -68,7 +67,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     return 1 if report.safe_ticks else 0
 
 
-def parse(arguments: Sequence[str] | None = None) -> argparse.Namespace:
+def parse(arguments: Sequence[str]) -> argparse.Namespace:
     """Parse the arguments; the process ends with status 2 if they are inconsistent."""
     parser, of_robot, of_env = command_parser()
     options = parser.parse_args(arguments)
@@ -161,11 +160,11 @@ def _run(options: argparse.Namespace) -> LoopReport:
         )  # fmt: skip
         if report.outcome:
             say(f"marked as a {report.outcome} on the live page")
-        say(_line(_HEADER))
         jitter = report.jitter
         numbers = [f"{jitter['ticks']:.0f}", f"{jitter['missed']:.0f}", f"{100 * jitter['on_time']:.2f} %"]
         times = (f"{jitter[key]:.3f}" for key in ("p50_ms", "p99_ms", "max_ms"))
-        say(_line((f"{options.mode}, {agent.transport}", *numbers, *times)))
+        for first, *cells in (_HEADER, (f"{options.mode}, {agent.transport}", *numbers, *times)):
+            say(f"{first:<20}" + "".join(f"{cell:>13}" for cell in cells))
         _say_outcome(report, say, led=leader is not None)
     if recorder is not None:  # closed: everything is written
         say(f"recorded: {recorder.episodes} episodes in {options.record}, {recorder.dropped} frames dropped")
@@ -329,7 +328,3 @@ def command_parser() -> tuple[argparse.ArgumentParser, list[argparse.Action], li
     simulated("--episodes", type=rows, default=10, metavar="N", help="how many (%(default)s)")
     simulated("--seed", type=int, default=0, help="of the first episode; the others count on (%(default)s)")
     return parser, of_robot, of_env
-
-
-def _line(cells: Sequence[str]) -> str:
-    return f"{cells[0]:<20}" + "".join(f"{cell:>13}" for cell in cells[1:])

@@ -65,7 +65,6 @@ def _checked(options: argparse.Namespace, stack: contextlib.ExitStack) -> RobotR
 
 
 def command_parser() -> argparse.ArgumentParser:
-    """Return the parser of the command."""
     parser = argparse.ArgumentParser(
         prog="vlagents-ray robot check", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )

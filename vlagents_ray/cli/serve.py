@@ -26,8 +26,6 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class ServeOptions:
-    """The options of `vlagents-ray serve`."""
-
     source: Annotated[str, typer.Argument(help="A registered policy, 'module:Class', or a deployment file (.yaml).")]
     host: Annotated[
         str | None, typer.Option(help="0.0.0.0, or an address of this machine; default: the file's, or 127.0.0.1.")

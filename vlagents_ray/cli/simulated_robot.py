@@ -22,10 +22,9 @@ from vlagents_ray.robot import Guard, run_loop
 from vlagents_ray.robot.episode import Label
 from vlagents_ray.robot.record import Recorder
 from vlagents_ray.robot.simulated import EnvRobot
-from vlagents_ray.robot.teleoperation import HELP, AxesDevice, AxesLeader, Keyboard, SpaceMouse, TeleoperatedAgent
+from vlagents_ray.robot.teleoperation import HELP, AxesLeader, Keyboard, SpaceMouse, TeleoperatedAgent
 from vlagents_ray.viewers import EpisodeViewer, open_viewer
 
-DEVICES = ("keyboard", "spacemouse")
 KEYS = "p pauses and continues; y success, n failure, x discard end the episode; q quits"
 _HZ = 10.0  # of environments that state no rate
 _MOVES = {
@@ -111,9 +110,9 @@ class RobotRun:
                 if self.over:
                     break
                 self._play(env, agent, seed, hz, guard)
-        if (recorder := self.recorder) is not None:  # closed, so everything is written
-            kept = f"{recorder.episodes} episodes in {self.options.record}"
-            out.print(f"recorded: {kept}, {recorder.dropped} frames dropped")
+        if self.recorder is not None:  # closed, so everything is written
+            kept = f"{self.recorder.episodes} episodes in {self.options.record}"
+            out.print(f"recorded: {kept}, {self.recorder.dropped} frames dropped")
         if self._viewer is not None:
             out.print(self._viewer.report())
 
@@ -149,15 +148,15 @@ class RobotRun:
     def _leader(self, contract: Contract, stack: contextlib.ExitStack) -> Leader | None:
         if self.options.leader is None:
             return None
-        if self.options.leader not in DEVICES:
-            raise ConfigError(f"--leader: got {self.options.leader!r}, want one of {list(DEVICES)}")
-        device: AxesDevice
+        device: Keyboard | SpaceMouse
         if self.options.leader == "keyboard":
             verdicts = {"y": "success", "n": "failure", "x": "discard"}
             keys = {key: lambda label=label: setattr(self, "verdict", label) for key, label in verdicts.items()}
             device = stack.enter_context(Keyboard({**keys, "p": self._pause, "q": self._quit}))
-        else:
+        elif self.options.leader == "spacemouse":
             device = stack.enter_context(SpaceMouse())
+        else:
+            raise ConfigError(f"--leader: got {self.options.leader!r}, want one of ['keyboard', 'spacemouse']")
         return AxesLeader(contract, device, step=self.options.step)
 
     def _agent(self, contract: Contract, leader: Leader | None, guard: Guard) -> Agent:
@@ -174,8 +173,7 @@ class RobotRun:
         policy = EnvPolicy(inner, contract)
         policy.initialize()
         require_match(inner.contract, contract)
-        given = self.options
-        settings = PlayerSettings(given.mode, given.execute)
+        settings = PlayerSettings(self.options.mode, self.options.execute)
         return ChunkPlayer(policy, settings, check=guard, override=leader)
 
     def _pause(self) -> None:

@@ -27,7 +27,6 @@ PROTOCOL = BenchmarkProtocol(
     ends_on_success=True,
     episodes=50,
 )
-_SOLVED = 4.0
 _TASKS = {
     "transfer_cube": "pick up the cube with the right arm and transfer it to the left arm",
     "insertion": "insert the peg into the socket",
@@ -116,7 +115,7 @@ class Aloha(SimulatorEnv):
     def _advance(self, action: np.ndarray) -> tuple[Obs, float, bool, dict[str, Any]]:
         """Execute an action; the reward is the stage of the task in the new state, 0 to 4."""
         qpos, reward, *_ = self._env.step(action.astype(np.float64))
-        return self._observe(qpos, look=self.looked_at), float(reward), *self._solved(bool(reward == _SOLVED))
+        return self._observe(qpos, look=self.looked_at), float(reward), *self._solved(bool(reward == 4))
 
     def _observe(self, qpos: np.ndarray, *, look: bool = True) -> Obs:
         images = self._cameras.render(self._physics.data.ptr) if look else {}

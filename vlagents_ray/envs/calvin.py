@@ -35,8 +35,6 @@ from vlagents_ray.registry import require
 
 NUMBER = 1000
 _LENGTH = 5
-_EVALUATION = Path("calvin_models/calvin_agent/evaluation")
-_FNV_PRIME = 0x01000193
 
 
 @dataclass(frozen=True, slots=True)
@@ -56,7 +54,7 @@ class Chains:
     """
 
     def __init__(self, checkout: Path) -> None:
-        evaluation = checkout / _EVALUATION
+        evaluation = checkout / "calvin_models/calvin_agent/evaluation"
         utils = _definitions(
             evaluation / "utils.py",
             contextlib=contextlib,
@@ -97,10 +95,10 @@ def _places(_: Callable[..., Any], jobs: Iterable[tuple[Any, int, int]]) -> list
 
 
 def fnv1_32(text: str) -> int:
-    """Return pyhash's FNV-1 hash, whose initial value is 0."""
+    """Return pyhash's FNV-1 hash, whose initial value is 0 and whose prime is 0x01000193."""
     found = 0
     for byte in text.encode():
-        found = (found * _FNV_PRIME % 2**32) ^ byte
+        found = (found * 0x01000193 % 2**32) ^ byte
     return found
 
 

@@ -13,6 +13,7 @@ that loads it. Their results are cached for the life of the process.
 
 from __future__ import annotations
 
+import contextlib
 import ctypes
 import functools
 import importlib.util
@@ -42,8 +43,6 @@ _Value = ctypes.c_ssize_t  # EGLAttrib
 
 @dataclass(frozen=True, slots=True)
 class EglDevice:
-    """A device of EGL."""
-
     number: int  # in EGL's own order, as in MUJOCO_EGL_DEVICE_ID
     software: bool
     cuda: int | None  # its number among the CUDA devices that this process may use; None if CUDA does not know it
@@ -75,17 +74,17 @@ class _Functions:
         handles, number = (ctypes.c_void_p * _MOST)(), ctypes.c_int()
         if not self._query(_MOST, handles, ctypes.byref(number)):
             return []
-        return [(handles[i], self._device(i, handles[i])) for i in range(number.value)]
+        found = []
+        for i, handle in enumerate(handles[: number.value]):
+            extensions = (self._text(handle, _EXTENSIONS) or b"").decode().split()
+            cuda = self.value(self._attribute, handle, _CUDA_DEVICE) if _CUDA in extensions else None
+            found.append((handle, EglDevice(i, _SOFTWARE in extensions, cuda)))
+        return found
 
     def value(self, ask: Callable[..., int], of: int | None, what: int) -> int | None:
         """Return the value of an attribute; None if it has no value."""
         found = _Value(-1)
         return found.value if ask(of, what, ctypes.byref(found)) and found.value >= 0 else None
-
-    def _device(self, number: int, handle: int | None) -> EglDevice:
-        extensions = (self._text(handle, _EXTENSIONS) or b"").decode().split()
-        cuda = self.value(self._attribute, handle, _CUDA_DEVICE) if _CUDA in extensions else None
-        return EglDevice(number, _SOFTWARE in extensions, cuda)
 
     def _extension(self, name: str, result: Any, *arguments: Any) -> Any:
         if not (address := self.library.eglGetProcAddress(name.encode())):
@@ -165,9 +164,7 @@ def choose_devices() -> None:
 
 def opengl_renderer() -> Renderer | None:
     """Return the renderer of this thread's OpenGL context; None if there is none, or if it is not EGL's."""
-    functions = _functions()
-    display = None if functions is None else functions.library.eglGetCurrentDisplay()
-    if functions is None or not display:
+    if (functions := _functions()) is None or not (display := functions.library.eglGetCurrentDisplay()):
         return None
     handle = functions.value(functions.display_attribute, display, _DEVICE)
     device = next((device for pointer, device in functions.devices() if pointer == handle), None)
@@ -245,7 +242,6 @@ _BOX_XML = """
 class RenderProbe:
     """The outcome of rendering one frame."""
 
-    api: Literal["vulkan", "egl"]
     ok: bool
     seconds: float  # the child's run time, imports included
     device: str | None = None  # the driver's name of the device; "llvmpipe ..." is Mesa's software driver
@@ -284,9 +280,8 @@ def vulkan_device(*, on_gpu: bool) -> tuple[str, int | None] | None:
 def usable_devices(summary: str) -> list[tuple[str, int | None]]:
     """List the devices that SAPIEN's `summary` calls supported, in its order.
 
-    Returns:
-        For each device its name, such as "llvmpipe (LLVM 15.0.6, 256 bits)", and its number among the CUDA devices of
-        this process; None if CUDA does not know it.
+    Each has a name, such as "llvmpipe (LLVM 15.0.6, 256 bits)", and its number among the CUDA devices of this process;
+    None if CUDA does not know it.
     """
     found = []
     for block in summary.split("GPU:")[1:]:
@@ -302,17 +297,14 @@ def _probed(api: Literal["vulkan", "egl"], module: str, extra: str, cure: str, t
     """Render one frame in a child process with `module`, which the extra `extra` installs."""
     if importlib.util.find_spec(module) is None:
         error, cure = f"{module} is not installed", f"pip install 'vlagents-ray[{extra}]'"
-        return RenderProbe(api, ok=False, seconds=0.0, error=error, cure=cure)
+        return RenderProbe(ok=False, seconds=0.0, error=error, cure=cure)
     root = str(Path(vlagents_ray.__file__).parents[1])
     path = os.pathsep.join(filter(None, [root, os.environ.get("PYTHONPATH")]))
-    variables = {**os.environ, "PYTHONPATH": path}
-    if api == "egl":
-        variables["MUJOCO_GL"] = "egl"
     started = time.monotonic()
     try:
         child = subprocess.run(  # noqa: S603 - our own interpreter and module, no outside input
             [sys.executable, "-c", f"from {__name__} import _main; _main({api!r})"],
-            env=variables,
+            env={**os.environ, "PYTHONPATH": path, "MUJOCO_GL": "egl"},  # which SAPIEN does not read
             stdin=subprocess.DEVNULL,
             capture_output=True,
             text=True,
@@ -322,15 +314,15 @@ def _probed(api: Literal["vulkan", "egl"], module: str, extra: str, cure: str, t
         )
     except subprocess.TimeoutExpired:
         error = f"no frame within {timeout_s:g} s"
-        return RenderProbe(api, ok=False, seconds=time.monotonic() - started, error=error, cure=cure)
+        return RenderProbe(ok=False, seconds=time.monotonic() - started, error=error, cure=cure)
     seconds = time.monotonic() - started
     if child.returncode == 0:
         answer = json.loads(child.stdout.splitlines()[-1])
         devices = tuple(EglDevice(**one) for one in answer["devices"])
-        return RenderProbe(api, ok=True, seconds=seconds, device=answer["device"], devices=devices)
+        return RenderProbe(ok=True, seconds=seconds, device=answer["device"], devices=devices)
     errors = [line for line in child.stderr.splitlines() if line.strip()]
     ended = f"the child ended with {child.returncode}"
-    return RenderProbe(api, ok=False, seconds=seconds, error=errors[-1].strip() if errors else ended, cure=cure)
+    return RenderProbe(ok=False, seconds=seconds, error=errors[-1].strip() if errors else ended, cure=cure)
 
 
 def _render_vulkan() -> str | None:
@@ -363,13 +355,10 @@ def _render_egl() -> str | None:
     model = mujoco.MjModel.from_xml_string(_BOX_XML)
     data = mujoco.MjData(model)
     mujoco.mj_forward(model, data)
-    renderer = mujoco.Renderer(model, 64, 64)
-    try:
+    with contextlib.closing(mujoco.Renderer(model, 64, 64)) as renderer:
         renderer.update_scene(data, camera="front")
         _require_contrast(np.asarray(renderer.render()))
         name = glGetString(GL_RENDERER)
-    finally:
-        renderer.close()
     return name.decode() if isinstance(name, bytes) else None
 
 

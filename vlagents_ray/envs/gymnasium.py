@@ -24,7 +24,6 @@ from vlagents_ray.interface import Act, Obs
 from vlagents_ray.naming import did_you_mean
 from vlagents_ray.registry import require
 
-TERMINATED = "terminated"
 SUCCESS_KEYS = ("is_success", "success")
 RENDER = "render"  # in place of a path: the image of the environment's own renderer
 _PATH = re.compile(r"(?P<keys>[^\[\]]*?)(?:\[(?P<start>-?\d*):(?P<stop>-?\d*)\])?")
@@ -221,9 +220,13 @@ class Gymnasium(EvalEnv):
     def step(self, act: Act) -> tuple[Obs, float, bool, bool, dict[str, Any]]:
         if not self._ready:
             raise NotReset(f"{self._name}: step before reset; call reset(seed=...) first")
-        nested, reward, terminated, truncated, info = self._call("step", self._command(act))
+        action = one_row(act, self._contract).astype(np.float64)
+        if self._unit_actions:
+            action = self._low + (action + 1) / 2 * (self._high - self._low)
+        action = np.clip(action, self._low, self._high).astype(self._dtype)
+        nested, reward, terminated, truncated, info = self._call("step", action)
         self._steps += 1
-        if self._success == TERMINATED:
+        if self._success == "terminated":
             success = bool(terminated)
         elif self._success is not None:
             success = bool(Pick.parse(self._success).value(info))
@@ -277,14 +280,6 @@ class Gymnasium(EvalEnv):
             share = (self._gripper.number(nested) - self._closed) / (self._open - self._closed)
             gripper = min(max(share, 0.0), 1.0)
         return Obs(cameras, gripper, {name: pick.vector(nested) for name, pick in self._state.items()})
-
-    def _command(self, act: Act) -> np.ndarray:
-        """Convert an action to the environment's, (D,); raises `InvalidAction` if the policy's is not valid."""
-        action = one_row(act, self._contract).astype(np.float64)
-        if self._unit_actions:
-            action = self._low + (action + 1) / 2 * (self._high - self._low)
-        clipped: np.ndarray = np.clip(action, self._low, self._high).astype(self._dtype)
-        return clipped
 
     def _contract_of(self, obs: Obs, control_hz: float | None) -> Contract:
         low, high = (-1.0, 1.0) if self._unit_actions else (uniform(self._low), uniform(self._high))

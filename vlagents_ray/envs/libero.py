@@ -59,8 +59,6 @@ _ATTEMPTS = 1000  # at placing the scene's objects; the first nearly always succ
 
 @dataclass(frozen=True, slots=True)
 class Suite:
-    """A suite of LIBERO or LIBERO-PRO."""
-
     tasks: int
     max_steps: int  # openpi, examples/libero/main.py; openvla, run_libero_eval.py: above the longest demonstration
 
@@ -132,8 +130,6 @@ class LiberoProtocol:
 
 @dataclass(frozen=True, slots=True)
 class LiberoTask:
-    """A task of a suite of LIBERO."""
-
     suite: str
     number: int  # in the suite, as openpi and OpenVLA count
     name: str  # LIBERO's, e.g. "pick_up_the_milk_and_place_it_in_the_basket"
@@ -217,9 +213,8 @@ class Libero(SimulatorEnv):
     `info["sim_state"]`, for scripted experts only: `positions` of objects and of the goal's regions, (3,) m in the
     world frame; `quaternions` of objects, (4,) xyzw; the predicates of the `goal`, and those of them that are `unmet`.
 
-    Action: (7,) in [-1, 1]: the end effector's target moves by 0.05 m per unit along the base's axes, and
-    turns by 0.5 rad per unit about them, axis-angle; the last is the gripper: -1 opens, 1 closes, and only
-    its sign counts.
+    Action: (7,) in [-1, 1]: the end effector's target moves by 0.05 m per unit along the base's axes, and turns by 0.5
+    rad per unit about them, axis-angle; the last is the gripper: -1 opens, 1 closes, and only its sign counts.
 
     An episode is a pure function of its initial state, `options["init_state"]`. Without that option the seed
     selects the state; otherwise only the policy uses the seed.
@@ -417,9 +412,7 @@ class LiberoSimulation:
         self._cameras.open = False
         with seeded(self._protocol.simulator_seed):
             crowded = require("robosuite.utils.errors").RandomizationError
-            for _ in range(
-                _ATTEMPTS
-            ):  # in place of `OffScreenRenderEnv.reset`, which repeats after any error, without end
+            for _ in range(_ATTEMPTS):  # `OffScreenRenderEnv.reset` would repeat after any error, without end
                 with contextlib.suppress(crowded):  # the drawn places overlap: draw again
                     self._env.env.reset()
                     break

@@ -201,7 +201,10 @@ class Rcs(SimulatorEnv):
             cameras: Cameras of the scene to return; None selects all.
         """
         task = self.tasks()[0] if task is None else task
-        self._task = self._find(task, module)
+        if task not in self.known:
+            self.require_task(task)
+        found = self.known.get(task) or RcsTask(id=task, module=None)
+        self._task = found if module is None else replace(found, module=module)
         protocol = self._task.protocol
         limit = protocol.max_steps if max_steps is None and protocol is not None else max_steps
         if limit is None:
@@ -286,13 +289,6 @@ class Rcs(SimulatorEnv):
         task_info = {key: value for key, value in info.items() if key not in self._arms.names}  # drops entries of arms
         outcome = {**plain(task_info), "success": bool(info["success"])}
         return self._observe(raw), float(reward), bool(terminated), outcome
-
-    def _find(self, task: str, module: str | None) -> RcsTask:
-        if task in self.known:
-            found = self.known[task]
-            return replace(found, module=module) if module is not None else found
-        self.require_task(task)
-        return RcsTask(id=task, module=module)
 
     def _observe(self, raw: Mapping[str, Any]) -> Obs:
         state, gripper = self._arms.read(raw)

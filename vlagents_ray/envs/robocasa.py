@@ -26,10 +26,7 @@ SIZE = 256  # px, of each image, as in the datasets and in RoboCasa's own Gymnas
 CAMERAS = ("robot0_agentview_left", "robot0_agentview_right", "robot0_eye_in_hand")
 
 Split = Literal["target", "pretrain"]
-SPLITS: tuple[Split, ...] = get_args(Split)
-
 ActionOrder = Literal["base_first", "arm_first"]
-ACTION_ORDERS: tuple[ActionOrder, ...] = get_args(ActionOrder)
 
 # RoboCasa's three sets of tasks with their horizons in steps, from dataset_registry.py of version 1.0.1: 1.5 times
 # those of 1.0.0.
@@ -172,8 +169,8 @@ class RoboCasa(RobosuiteEnv):
         """
         super().__init__(task, width=width, height=height, max_steps=max_steps)
         for option, chosen, known in (
-            ("split", [split], SPLITS),
-            ("action_order", [action_order], ACTION_ORDERS),
+            ("split", [split], get_args(Split)),
+            ("action_order", [action_order], get_args(ActionOrder)),
             ("object_registries", object_registries, REGISTRIES),
         ):
             if not chosen or not set(chosen) <= set(known):

@@ -151,17 +151,6 @@ def importing_robosuite(env: str) -> Iterator[None]:
 
 
 CONTROL_HZ = 20.0
-_PROTOCOL = BenchmarkProtocol(
-    name="robomimic",
-    source="Mandlekar et al. 2021, arXiv 2108.03298; robomimic 0.3.0, dataset registry and base_config.py",
-    max_steps=400,
-    control_hz=CONTROL_HZ,
-    control="pose of the hand, delta, by OSC_POSE: 0.05 m and 0.5 rad a unit",
-    success="robosuite's own check of the task holds after a step",
-    begins="where the objects lie, and noise on the arm's joints: the seed's",
-    ends_on_success=True,
-    episodes=50,
-)
 
 
 @dataclass(frozen=True, slots=True)
@@ -176,7 +165,17 @@ class RobosuiteTask:
 
     @property
     def protocol(self) -> BenchmarkProtocol:
-        return replace(_PROTOCOL, max_steps=self.max_steps)
+        return BenchmarkProtocol(
+            name="robomimic",
+            source="Mandlekar et al. 2021, arXiv 2108.03298; robomimic 0.3.0, dataset registry and base_config.py",
+            max_steps=self.max_steps,
+            control_hz=CONTROL_HZ,
+            control="pose of the hand, delta, by OSC_POSE: 0.05 m and 0.5 rad a unit",
+            success="robosuite's own check of the task holds after a step",
+            begins="where the objects lie, and noise on the arm's joints: the seed's",
+            ends_on_success=True,
+            episodes=50,
+        )
 
 
 TASKS: Mapping[str, RobosuiteTask] = {

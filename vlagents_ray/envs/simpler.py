@@ -10,7 +10,6 @@ from __future__ import annotations
 import math
 import os
 import sys
-from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -39,21 +38,17 @@ _DATA = {"bridge_v2_real2sim": "tasks/bridge_v2_real2sim_dataset", "widowx250s":
 _DOWNLOADS = " && ".join(f"python -m mani_skill.utils.download_asset {name}" for name in _DATA)
 
 
-@dataclass(frozen=True, slots=True)
-class SimplerProtocol:
-    """The protocol of SIMPLER's own script for ManiSkill 3, real2sim_eval_maniskill3.py."""
-
-    setting: str = "visual matching"
-    success: str = "at the end"  # in the last state; success at any step is also reported
-    initial_states: str = "by episode id"
-    control_mode: str = "arm_pd_ee_target_delta_pose_align2_gripper_pd_joint_pos"
-    obs_mode: str = "rgb+segmentation"
-    shader: str = "default"
-    gripper_open_above: float = 0.5  # the command is binarised at this value
-    sticky_gripper_steps: int = 1  # 15 only for the Google robot, whose scenes ManiSkill 3 does not have
-
-
-PROTOCOL = SimplerProtocol()
+# The protocol of SIMPLER's own script for ManiSkill 3, real2sim_eval_maniskill3.py.
+PROTOCOL: dict[str, Any] = {
+    "setting": "visual matching",
+    "success": "at the end",  # in the last state; success at any step is also reported
+    "initial_states": "by episode id",
+    "control_mode": "arm_pd_ee_target_delta_pose_align2_gripper_pd_joint_pos",
+    "obs_mode": "rgb+segmentation",
+    "shader": "default",
+    "gripper_open_above": 0.5,  # the command is binarised at this value
+    "sticky_gripper_steps": 1,  # 15 only for the Google robot, whose scenes ManiSkill 3 does not have
+}
 
 
 class Simpler(SimulatorEnv):
@@ -68,9 +63,8 @@ class Simpler(SimulatorEnv):
     its change of roll, pitch and yaw in rad, and the gripper, 1 open, 0 closed. It is relative to the last command, not
     to the measured pose. As in SIMPLER's script, the controller reads the rotation as the numbers of a rotation vector.
 
-    The initial state is `options["init_state"]`, SIMPLER's episode id; without it the seed modulo
-    `init_states`. The seed has no other effect. The env continues after success, and never reports
-    `terminated`.
+    The initial state is `options["init_state"]`, SIMPLER's episode id; without it the seed modulo `init_states`. The
+    seed has no other effect. The env continues after success, and never reports `terminated`.
     """
 
     suite, known = "simpler", tuple(TWINS)
@@ -84,7 +78,7 @@ class Simpler(SimulatorEnv):
         max_steps: int | None = None,
         sim_backend: str = "physx_cpu",
         render_backend: str = "auto",
-        shader: str = PROTOCOL.shader,
+        shader: str = PROTOCOL["shader"],
     ) -> None:
         """Make the environment; raises the errors of `make_env`. Other options are described in `SimulatorEnv`.
 
@@ -110,8 +104,8 @@ class Simpler(SimulatorEnv):
             raise EnvFailed(missing)
         self.max_steps, own_limit = step_limits(self._name, task, max_steps)
         self._deviations = [] if self.max_steps == own_limit else [f"max_steps is {max_steps}, not {own_limit}"]
-        if shader != PROTOCOL.shader:
-            self._deviations.append(f"shader is {shader}, not {PROTOCOL.shader}")
+        if shader != PROTOCOL["shader"]:
+            self._deviations.append(f"shader is {shader}, not {PROTOCOL['shader']}")
         self._task = task
         self._given_instruction = instruction
         # ManiSkill keeps the photographs, and the objects that they must not hide, in lists of the class. A second twin
@@ -121,10 +115,10 @@ class Simpler(SimulatorEnv):
         self._env = Simulator(
             self._name,
             task,
-            obs_mode=PROTOCOL.obs_mode,
+            obs_mode=PROTOCOL["obs_mode"],
             sim_backend=sim_backend,
             render_backend=render_backend,
-            control_mode=PROTOCOL.control_mode,
+            control_mode=PROTOCOL["control_mode"],
             sensors={"shader_pack": shader},
         )
         self._resources.callback(self._env.close)
@@ -151,7 +145,7 @@ class Simpler(SimulatorEnv):
             **self._alive().describe(),
             "success": TWINS[self._task],
             "assets": str(require("mani_skill").ASSET_DIR.parent),
-            "protocol": {**asdict(PROTOCOL), "deviations": self._deviations},
+            "protocol": {**PROTOCOL, "deviations": self._deviations},
         }
 
     def _begin(self, seed: int, state: int) -> tuple[Obs, dict[str, Any]]:
@@ -184,7 +178,7 @@ def _command(action: np.ndarray) -> np.ndarray:
     """Convert an action to ManiSkill's controller, both (7,): rotation vector, gripper -1 closed, 1 open."""
     roll, pitch, yaw = action[3:6].tolist()
     axis, angle = require("transforms3d.euler").euler2axangle(roll, pitch, yaw)
-    gripper = 1.0 if action[6] > PROTOCOL.gripper_open_above else -1.0
+    gripper = 1.0 if action[6] > PROTOCOL["gripper_open_above"] else -1.0
     return np.concatenate([action[:3], np.asarray(axis) * angle, [gripper]]).astype(np.float32)
 
 

@@ -220,15 +220,15 @@ class MujocoCameras:
 
     def render(self, data: Any) -> dict[str, np.ndarray]:
         """Render a `mujoco.MjData`: the images by camera, (H, W, 3) uint8."""
-        return {name: self._image(data, name) for name in self._cameras}
+        images = {}
+        for camera in self._cameras:
+            self._renderer.update_scene(data, camera=camera)
+            image: np.ndarray = self._renderer.render()
+            images[camera] = np.ascontiguousarray(image[::-1, ::-1]) if camera in self._upside_down else image
+        return images
 
     def close(self) -> None:
         self._renderer.close()
-
-    def _image(self, data: Any, camera: str) -> np.ndarray:
-        self._renderer.update_scene(data, camera=camera)
-        image: np.ndarray = self._renderer.render()
-        return np.ascontiguousarray(image[::-1, ::-1]) if camera in self._upside_down else image
 
 
 def require_sizes(env: str, **sizes: int | None) -> None:

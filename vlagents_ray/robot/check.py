@@ -105,8 +105,6 @@ class Finding:
 
 @dataclass
 class RobotReport:
-    """The outcome of a check of a robot."""
-
     findings: list[Finding] = field(default_factory=list)
     passed: list[str] = field(default_factory=list)  # keys of CHECKS
     skipped: dict[str, str] = field(default_factory=dict)  # check: the reason
@@ -493,12 +491,13 @@ class _Suite:
             self.report.skipped["pose"] = "observations have no 'tquat', the pose of the hand"
             return
         (p0, q0), (p1, q1) = ((obs.state[key][:3], obs.state[key][3:].astype(float)) for obs in (before, after))
-        turned = _times(q1, q0 * [-1, -1, -1, 1])
-        sine = np.linalg.norm(turned[:3])
-        angle = 2 * np.arctan2(sine, abs(turned[3]))
+        # The quaternion of the turn: q1 times the inverse of q0.
+        axis = q0[3] * q1[:3] - q1[3] * q0[:3] - np.cross(q1[:3], q0[:3])
+        sine = np.linalg.norm(axis)
+        angle = 2 * np.arctan2(sine, abs(q1 @ q0))
         change = abs(layout.measured(after)[joint] - layout.measured(before)[joint])
         change = np.deg2rad(change) if layout.unit == "deg" else change
-        along = abs(float((p1 - p0) @ turned[:3])) / max(1e-9, float(sine))
+        along = abs(float((p1 - p0) @ axis)) / max(1e-9, float(sine))
         if abs(angle - change) > 0.3 * change + 0.01:
             got = f"the hand turned by {angle:.3g} rad for {change:.3g} rad of {layout.names[joint]}"
             self.find("pose", got, "the same angle", "correct the rotation of the pose, or the unit of the joints")
@@ -636,9 +635,3 @@ def _card(before: np.ndarray, after: np.ndarray) -> _Card | None:
 def arm_part(arm: str, name: str) -> str:
     """Return the name of a part of the state for an arm; "" is the only one."""
     return f"{arm}/{name}" if arm else name
-
-
-def _times(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """Multiply quaternions xyzw."""
-    vector = a[3] * b[:3] + b[3] * a[:3] + np.cross(a[:3], b[:3])
-    return np.array([*vector, a[3] * b[3] - a[:3] @ b[:3]])

@@ -76,15 +76,13 @@ class Dataset:
             raise ConfigError(f"{root}: not a LeRobotDataset, and not empty; record into a new folder")
         # Remove the files of a running or uncounted episode after a crash.
         shutil.rmtree(root / UNFINISHED, ignore_errors=True)
-        number = self.episodes
-        stray = FILE.format(chunk_index=number // FILES_IN_CHUNK, file_index=number % FILES_IN_CHUNK)
+        stray = FILE.format(**_place(self.episodes))
         for folder in ("data", "videos/*", "meta/episodes"):
             for path in root.glob(f"{folder}/{stray}.*"):
                 path.unlink()
 
     @property
     def episodes(self) -> int:
-        """The number of episodes."""
         return int(self.info["total_episodes"])
 
     def begin(self, instruction: str, meaning: ActionSpec | None = None) -> RobotEpisode:
@@ -95,20 +93,14 @@ class Dataset:
         unfinished = self.root / UNFINISHED
         unfinished.mkdir(parents=True, exist_ok=True)
         folder = Path(tempfile.mkdtemp(dir=unfinished))
+        meaning = meaning or ActionSpec()
         return RobotEpisode(
-            folder,
-            instruction,
-            self.info["fps"],
-            self.info["features"],
-            self.interventions,
-            self._lossless,
-            meaning or ActionSpec(),
+            folder, instruction, self.info["fps"], self.info["features"], self.interventions, self._lossless, meaning
         )
 
     def save(self, episode: Finished) -> None:
-        """Add an episode to the dataset."""
         number, frames = self.episodes, len(episode.rows[ACTION])
-        place = {"chunk_index": number // FILES_IN_CHUNK, "file_index": number % FILES_IN_CHUNK}
+        place = _place(number)
         first = int(self.info["total_frames"])
         if episode.instruction not in self.tasks:
             self.tasks.append(episode.instruction)
@@ -170,8 +162,7 @@ class Dataset:
         if int(self._stats[ACTION]["count"][0]) != info["total_frames"]:  # a crash left an uncounted episode
             self._stats = {}
             for number in range(self.episodes):
-                place = {"chunk_index": number // FILES_IN_CHUNK, "file_index": number % FILES_IN_CHUNK}
-                [about] = self._pq.read_table(self.root / EPISODES.format(**place)).to_pylist()
+                [about] = self._pq.read_table(self.root / EPISODES.format(**_place(number))).to_pylist()
                 found: dict[str, Stats] = {}
                 for column, value in about.items():
                     if column.startswith("stats/"):
@@ -184,7 +175,7 @@ class Dataset:
         columns = {}
         for key, values in rows.items():
             if features[key]["shape"] == [1]:  # LeRobot reads a single number as a scalar, not as a list
-                columns[key] = pa.array(values.reshape(-1), getattr(pa, _ARROW[features[key]["dtype"]])())
+                columns[key] = pa.array(values.reshape(-1), pa.type_for_alias(features[key]["dtype"]))
             else:
                 flat = pa.array(np.ascontiguousarray(values, np.float32).ravel())
                 columns[key] = pa.FixedSizeListArray.from_arrays(flat, values.shape[1])
@@ -233,7 +224,9 @@ class Dataset:
             _sync(path.parent)
 
 
-_ARROW = {"float64": "float64", "float32": "float32", "int64": "int64", "bool": "bool_", "string": "string"}
+def _place(episode: int) -> dict[str, int]:
+    """Return the numbers in the names of an episode's files."""
+    return {"chunk_index": episode // FILES_IN_CHUNK, "file_index": episode % FILES_IN_CHUNK}
 
 
 def _sync(path: Path) -> None:

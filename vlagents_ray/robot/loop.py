@@ -370,7 +370,6 @@ class _Run:
         return safe if held is None and safe is not None and safe.cause in ("stopped", "paused") else held
 
     def _stop(self, why: Held) -> None:
-        """Command nothing at this tick."""
         if not self.standing:
             self.robot.stop()  # again, as the watchdog may have stopped it just before the last action
         self.standing = True

@@ -39,12 +39,10 @@ class ArmModel:
     arms: tuple[str, ...] = ()  # the names of several arms, in the order of the file
 
 
-_PANDA = (0.0, -0.3, 0.0, -1.9, 0.0, 1.6, 0.8)
-_ALOHA = (0.0, -0.96, 1.16, 0.0, -0.3, 0.0)
 ARMS = {
     "so101": ArmModel("robotstudio_so101", rest=(0.2, -0.6, 0.5, 0.8, 0.1)),
-    "franka": ArmModel("franka_emika_panda", rest=_PANDA),
-    "aloha": ArmModel("aloha", rest=2 * _ALOHA, arms=("left", "right")),
+    "franka": ArmModel("franka_emika_panda", rest=(0.0, -0.3, 0.0, -1.9, 0.0, 1.6, 0.8)),
+    "aloha": ArmModel("aloha", rest=2 * (0.0, -0.96, 1.16, 0.0, -0.3, 0.0), arms=("left", "right")),
     "ur5e": ArmModel("universal_robots_ur5e"),
     "xarm7": ArmModel("ufactory_xarm7", rest=(0.0, -0.25, 0.0, 0.9, 0.0, 1.1, 0.0), open_high=False),
 }
@@ -195,7 +193,6 @@ class MujocoArm:
         self._goal = self._target = np.array(held)
 
     def close(self) -> None:
-        """Close the renderer."""
         if self._renderer is not None:
             self._renderer.close()
             self._renderer = None
@@ -274,7 +271,9 @@ class MujocoArm:
         self._flat = [drive for drives in self._drives for drive in drives]
         if not all(any(not drive.gripper for drive in drives) for drives in self._drives):
             raise ConfigError(f"{stated.menagerie}: got an arm without joints that move, want the file of an arm")
-        self._hands = [self._hand(drives) for drives in self._drives]
+        last = [[drive for drive in drives if not drive.gripper][-1] for drives in self._drives]
+        joints = [int(self.model.actuator_trnid[drive.actuators[0], 0]) for drive in last]
+        self._hands = [int(self.model.jnt_bodyid[joint]) for joint in joints]
         self._bases = [int(self.model.body_rootid[hand]) for hand in self._hands]
         self._rest(stated)
 
@@ -356,10 +355,6 @@ class MujocoArm:
                 arms[number].append(drive)
             drive.actuators.append(index)
         return [[*drives, *([grip] if grip.actuators else [])] for drives, grip in zip(arms, grippers, strict=True)]
-
-    def _hand(self, drives: Sequence[_Drive]) -> int:
-        last = [drive for drive in drives if not drive.gripper][-1]
-        return int(self.model.jnt_bodyid[int(self.model.actuator_trnid[last.actuators[0], 0])])
 
     def _pose(self, body: int) -> tuple[np.ndarray, np.ndarray]:
         return self.data.xpos[body], self.data.xmat[body].reshape(3, 3)

@@ -18,7 +18,6 @@ from vlagents_ray.errors import ConfigError
 
 SPIN_S = 0.001
 """The last part of a wait, s, in which the thread spins: a sleeping thread wakes tens of microseconds late or more."""
-ON_TIME_S = 0.002
 KEPT_TICKS = 200_000  # the number of ticks whose lateness is kept, as a loop may run for days
 _SWITCH_S = 0.0005  # longest time for which another thread keeps the interpreter; Python's default is 5 ms
 _NICE = -10
@@ -31,14 +30,13 @@ class Pacer:
     A tick that is over before it could begin is skipped and counted as missed.
     """
 
-    def __init__(self, hz: float, spin_s: float = SPIN_S) -> None:
+    def __init__(self, hz: float) -> None:
         if not (math.isfinite(hz) and hz > 0):
             raise ConfigError(f"hz: got {hz}, want a rate above 0")
         self.period_s = 1.0 / hz
         self.missed = 0
         self.ticks = 0  # ticks that began
         self.late_s: deque[float] = deque(maxlen=KEPT_TICKS)  # lateness of the last ticks that began
-        self._spin_s = spin_s
         self._begin = time.perf_counter()
         self._tick = -1
 
@@ -51,8 +49,8 @@ class Pacer:
             self._tick += behind
             self.missed += behind
         due = self._begin + self._tick * self.period_s
-        if due - now > self._spin_s:
-            time.sleep(due - now - self._spin_s)
+        if due - now > SPIN_S:
+            time.sleep(due - now - SPIN_S)
         while (now := time.perf_counter()) < due:
             time.sleep(0)  # lets other threads have the interpreter and the core
         self.late_s.append(now - due)
@@ -81,7 +79,7 @@ def jitter(late_s: Sequence[float], missed: int, ticks: int | None = None) -> di
     return {
         "ticks": ticks,
         "missed": missed,
-        "on_time": float((late_ms <= ON_TIME_S * 1e3).mean()) * ticks / max(1, ticks + missed),
+        "on_time": float((late_ms <= 2).mean()) * ticks / max(1, ticks + missed),
         "p50_ms": float(np.median(late_ms)),
         "p99_ms": float(np.quantile(late_ms, 0.99)),
         "max_ms": float(late_ms.max()),

@@ -148,8 +148,8 @@ class Guard:
                 raise InvalidAction(
                     f"action[{i}]: got {number:g}, {name} the limit {limit:g}; see the contract", cause="limits"
                 )
-        if self.limits is not None and not self._relative:
-            self._check_workspace(now)
+        if self.limits is not None and self.limits.chain is not None and not self._relative:
+            self._check_workspace(self.limits, self.limits.chain.tip(now))
         if last is None:
             self._then, self._speed, self._change = now, [0.0] * len(now), [0.0] * len(now)
             return action
@@ -262,11 +262,7 @@ class Guard:
             cause="max_step" if order == 1 else "dynamics",
         )
 
-    def _check_workspace(self, now: list[float]) -> None:
-        limits = self.limits
-        if limits is None or limits.chain is None:
-            return
-        tip = limits.chain.tip(now)
+    def _check_workspace(self, limits: Limits, tip: tuple[float, float, float]) -> None:
         for bound, wrong, name in ((limits.workspace_low, 1, "below"), (limits.workspace_high, -1, "above")):
             for axis, place, limit in zip("xyz", tip, bound or tip, strict=True):
                 if wrong * (limit - place) > 0:

@@ -32,9 +32,8 @@ class SimulatedRobot:
         contract = contract or Contract()
         self._action: ActionSpec = contract.action
         self._parts = {name: spec.dim for name, spec in (contract.state or {"joints": StateSpec()}).items()}
-        self._pictures: dict[
-            str, np.ndarray
-        ] = {}  # gradients with a little noise, which codecs compress like a camera's
+        # Gradients with a little noise, which codecs compress like a camera's.
+        self._pictures: dict[str, np.ndarray] = {}
         for name, camera in (contract.cameras or {"front": CameraSpec(), "wrist": CameraSpec()}).items():
             height, width = camera.height or _SIDE, camera.width or _SIDE
             y, x = np.mgrid[:height, :width]
@@ -53,14 +52,9 @@ class SimulatedRobot:
             name: np.resize(self._joints, dim if dim is not None else len(self._joints)).astype(np.float32)
             for name, dim in self._parts.items()
         }
-        spec, opening = self._action, 1.0
-        if (
-            spec.gripper_open is not None
-            and spec.gripper_closed is not None
-            and spec.gripper_open != spec.gripper_closed
-        ):
-            share = (float(self._joints[-1]) - spec.gripper_closed) / (spec.gripper_open - spec.gripper_closed)
-            opening = min(1.0, max(0.0, share))
+        opened, closed, opening = self._action.gripper_open, self._action.gripper_closed, 1.0
+        if opened is not None and closed is not None and opened != closed:
+            opening = min(1.0, max(0.0, (float(self._joints[-1]) - closed) / (opened - closed)))
         images = {name: still.copy() for name, still in self._pictures.items()}
         turn = float(self._joints[0])
         for image in images.values():

@@ -23,7 +23,6 @@ from vlagents_ray.registry import require
 __all__ = ["AxesDevice", "AxesLeader", "Keyboard", "Leader", "SpaceMouse", "TeleoperatedAgent"]
 
 _FULLY_OPEN = 0.9  # below this opening, a gripper may hold something
-_SPEED = 0.5
 
 
 class AxesDevice(ABC):
@@ -80,7 +79,7 @@ class AxesLeader:
                 f"relative): state them in the policy's contract; with noop, serve it with `--set delta=false`"
             )
         if step is None and spec.relative and spec.low is not None and spec.high is not None:
-            step = _SPEED * min(abs(spec.low), abs(spec.high))
+            step = min(abs(spec.low), abs(spec.high)) / 2
         if step is None or not step > 0:
             raise ConfigError(
                 f"step: got {step}, want the change of a number at a tick, above 0; the contract has no bounds of "
@@ -108,7 +107,13 @@ class AxesLeader:
         moved = np.zeros(self._dim, np.float32)
         n = min(self._dim - gripper, len(axes))
         moved[:n] = self._step * axes[:n]
-        command = self._gripper(obs) if gripper else None
+        command = None
+        if gripper:
+            if self._closed is None:
+                self._closed = obs.gripper is not None and obs.gripper < _FULLY_OPEN
+            if self._device.gripper_presses() % 2:
+                self._closed = not self._closed
+            command = float((spec.gripper_closed if self._closed else spec.gripper_open) or 0.0)
         if not spec.relative:
             if self._target is None and self._measure is not None:
                 self._target = np.array(self._measure(obs), np.float32)
@@ -123,13 +128,6 @@ class AxesLeader:
         if command is not None:
             moved[-1] = command
         return moved.astype(np.float32)
-
-    def _gripper(self, obs: Obs) -> float:
-        if self._closed is None:
-            self._closed = obs.gripper is not None and obs.gripper < _FULLY_OPEN
-        if self._device.gripper_presses() % 2:
-            self._closed = not self._closed
-        return float((self._spec.gripper_closed if self._closed else self._spec.gripper_open) or 0.0)
 
 
 # A keyboard as a device with axes, read from the terminal so that it also works over SSH.
@@ -285,7 +283,6 @@ class TeleoperatedAgent(Agent):
 
 # The only reader of the terminal, so that each typed key has exactly one consumer.
 
-_POLL_S = 0.1
 Consumer = Callable[[str], bool]  # gets a key in lower case; returns whether it has a meaning for that key
 
 
@@ -357,7 +354,7 @@ class Terminal:
         over = threading.Event()
 
         def read() -> None:
-            while self.read(consumer) and not over.wait(_POLL_S):
+            while self.read(consumer) and not over.wait(0.1):
                 pass
 
         thread = threading.Thread(target=read, name="vlagents-ray-terminal", daemon=True)

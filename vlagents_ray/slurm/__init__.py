@@ -58,7 +58,7 @@ def submit_evaluation(
         HookFailed: The evaluation could not be submitted, and `raise_errors` is set.
     """
     try:
-        checkpoint, folder, words = os.fspath(checkpoint), Path(record), list(words)
+        checkpoint, folder, words, python = os.fspath(checkpoint), Path(record), list(words), os.fspath(python)
         name = hashlib.sha256(json.dumps([os.path.abspath(checkpoint), step, words]).encode()).hexdigest()[:16]
         folder.mkdir(parents=True, exist_ok=True)
         mark = folder / f"step-{step}-{name}.json"
@@ -68,14 +68,13 @@ def submit_evaluation(
             if other == mark or "words" not in abandoned or _abandoned_since(other) is None:
                 continue
             try:
-                if _is_claimed(other, abandoned):
-                    job, of = _submit(other, abandoned, os.fspath(python)), abandoned["step"]
+                if (job := _submit(other, abandoned, python)) is not None:
+                    of = abandoned["step"]
                     log.info("step %s: submitted as job %s, in place of a training that was killed", of, job)
             except Exception:
                 log.exception("the evaluation of step %s was not submitted; training continues", abandoned["step"])
         filled = [word.replace("{checkpoint}", checkpoint).replace("{step}", str(step)) for word in words]
-        claim = {"step": step, "checkpoint": checkpoint, "words": filled}
-        return _submit(mark, claim, os.fspath(python)) if _is_claimed(mark, claim) else None
+        return _submit(mark, {"step": step, "checkpoint": checkpoint, "words": filled}, python)
     except Exception as error:
         if raise_errors:
             raise HookFailed(f"step {step}: {error}") from error
@@ -107,8 +106,10 @@ def _abandoned_since(mark: Path) -> int | None:
     return None if "job" in _read(mark) or time.time() - since / 1e9 < _ABANDONED_S else since
 
 
-def _submit(mark: Path, claim: dict[str, Any], python: str) -> str:
-    """Submit a checkpoint that this process has claimed; a failure releases the claim."""
+def _submit(mark: Path, claim: dict[str, Any], python: str) -> str | None:
+    """Claim a checkpoint and submit it, unless another process does; a failure releases the claim."""
+    if not _is_claimed(mark, claim):
+        return None
     command = [python, "-c", "from vlagents_ray.cli import main; main()", "slurm", "eval", "--parsable"]
     try:
         done = subprocess.run(  # noqa: S603 - the caller's arguments

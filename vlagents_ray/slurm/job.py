@@ -13,6 +13,7 @@
 from __future__ import annotations
 
 import argparse
+import contextlib
 import datetime
 import json
 import os
@@ -24,7 +25,6 @@ import sys
 import tempfile
 import threading
 import time
-import urllib.error
 import urllib.request
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -144,16 +144,16 @@ def run_node() -> int:
     return 0 if allocation.node else status  # the job continues without a node other than the head
 
 
-def wait_for_head(host: str, port: int, timeout_s: float = _HEAD_S) -> None:
-    """Wait until Ray's head listens; after `timeout_s` the process exits with a message."""
-    deadline = time.monotonic() + timeout_s
+def wait_for_head(host: str, port: int) -> None:
+    """Wait until Ray's head listens; after `_HEAD_S` the process exits with a message."""
+    deadline = time.monotonic() + _HEAD_S
     while True:
         try:
             socket.create_connection((host, port), timeout=5).close()
         except OSError as error:
             if time.monotonic() > deadline:
-                sys.exit(f"Ray's head at {host}:{port} does not listen after {timeout_s:g} s ({error}); see its log")
-            time.sleep(0.5)
+                sys.exit(f"Ray's head at {host}:{port} does not listen after {_HEAD_S:g} s ({error}); see its log")
+            time.sleep(_POLL_S)
         else:
             return
 
@@ -196,26 +196,22 @@ def run_command(arguments: Sequence[str]) -> None:
     os.execv(sys.executable, [sys.executable, "-c", _COMMAND, given.what, *words])  # noqa: S606 - no shell
 
 
-def wait_for_nodes(address: str, number: int, timeout_s: float = _NODES_S) -> int:
-    """Wait until a number of nodes have joined the cluster.
-
-    Returns:
-        The number of CPUs of the cluster.
-    """
+def wait_for_nodes(address: str, number: int) -> int:
+    """Wait until a number of nodes have joined the cluster, and return its number of CPUs."""
     import ray
 
-    deadline = time.monotonic() + timeout_s
+    deadline = time.monotonic() + _NODES_S
     while not ray.is_initialized():
         try:
             ray.init(address=address, logging_level="ERROR", log_to_driver=False)
         except (ConnectionError, RuntimeError) as error:  # Ray does not run on this node yet
             if time.monotonic() > deadline:
-                sys.exit(f"no Ray at {address} in {timeout_s:g} s: {error}")
+                sys.exit(f"no Ray at {address} in {_NODES_S:g} s: {error}")
     try:
         while len(alive := [node for node in ray.nodes() if node["Alive"]]) < number:
             if time.monotonic() > deadline:
-                sys.exit(f"{len(alive)} of {number} nodes joined Ray in {timeout_s:g} s: {_names(alive)}; see the logs")
-            time.sleep(0.5)
+                sys.exit(f"{len(alive)} of {number} nodes joined Ray in {_NODES_S:g} s: {_names(alive)}; see the logs")
+            time.sleep(_POLL_S)
         sys.stdout.write(f"Ray runs on {_names(alive)}\n")
         sys.stdout.flush()
         return int(ray.cluster_resources().get("CPU", 1))
@@ -253,11 +249,7 @@ def announce(words: Sequence[str]) -> None:
 
 
 def connection_info(apps: Mapping[str, str], port: int, environ: Mapping[str, str]) -> dict[str, Any]:
-    """Return the address and key with which a client connects.
-
-    Returns:
-        The content of the file, with the URL of each application, the key, and a command for a tunnel.
-    """
+    """Return the content of the file: the URL of each application, the key, and a command for a tunnel."""
     host = socket.gethostname()
     url = f"http://{host}:{port}"
     login = environ.get("SLURM_SUBMIT_HOST", host)
@@ -294,15 +286,12 @@ def write(file: Path, found: Mapping[str, Any]) -> None:
 
 
 def _answers(url: str) -> bool:
-    try:
-        with urllib.request.urlopen(url, timeout=5):  # noqa: S310 - our own server
-            return True
-    except (urllib.error.URLError, OSError):
-        return False
+    with contextlib.suppress(OSError), urllib.request.urlopen(url, timeout=5):  # noqa: S310 - our own server
+        return True
+    return False
 
 
 def main() -> None:
-    """Run the program that the first argument names."""
     what, *words = sys.argv[1:]
     if what == "address":
         from ray.util import get_node_ip_address

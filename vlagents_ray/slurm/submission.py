@@ -42,11 +42,7 @@ _SBATCH_S = 120.0
 
 
 def split(words: Sequence[str], known: Mapping[str, bool]) -> tuple[list[str], dict[str, str | None]]:
-    """Split a command line.
-
-    Returns:
-        The command's own arguments, and sbatch's options by their long names, with None for options without a value.
-    """
+    """Return a command's own arguments, and sbatch's options by their long names, None for those without a value."""
     own: list[str] = []
     sbatch: dict[str, str | None] = {}
     waiting = iter(words)
@@ -104,11 +100,6 @@ class Script:
     def file(self) -> Path:
         return self.folder / f"{self.name}.sh"
 
-    @property
-    def log(self) -> str:
-        """The file of the job's output, as a pattern of sbatch."""
-        return self.options.get("output") or str(self.folder.absolute() / "%j.log")
-
     def text(self) -> str:
         """Return the content of the script.
 
@@ -121,7 +112,7 @@ class Script:
             "nodes": "1",
             "ntasks-per-node": "1",
             "chdir": os.getcwd(),
-            "output": self.log,
+            "output": str(self.folder.absolute() / "%j.log"),
             "open-mode": "append",
             **({} if "no-requeue" in self.options else {"requeue": None}),
         }
@@ -159,12 +150,11 @@ class SubmissionFailed(VLAgentsError):
 
 
 def submit(script: Script) -> str:
-    """Write a script, and submit it.
-
-    Returns:
-        The job's number.
-    """
-    file = write(script)
+    """Write a script, submit it, and return the job's number."""
+    file = script.file.absolute()
+    file.parent.mkdir(parents=True, exist_ok=True)
+    file.write_text(script.text())
+    file.chmod(0o700)
     try:
         done = subprocess.run(  # noqa: S603 - the user's own arguments
             ["sbatch", "--parsable", str(file)],  # noqa: S607 - found by PATH
@@ -179,14 +169,6 @@ def submit(script: Script) -> str:
     if done.returncode:
         raise SubmissionFailed(f"sbatch {file}: {done.stderr.strip() or done.stdout.strip()}")
     return done.stdout.strip().partition(";")[0]
-
-
-def write(script: Script) -> Path:
-    file = script.file.absolute()
-    file.parent.mkdir(parents=True, exist_ok=True)
-    file.write_text(script.text())
-    file.chmod(0o700)
-    return file
 
 
 def outside_of_jobs(environ: Mapping[str, str]) -> dict[str, str]:

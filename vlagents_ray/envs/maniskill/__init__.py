@@ -99,7 +99,7 @@ class ManiSkill(SimulatorEnv):
             reward_mode=reward_mode,
         )
         self._resources.callback(self._env.close)
-        self._contract = self._env.contract(self._env.action)
+        self._contract = self._env.contract()
 
     @property
     def instruction(self) -> str:
@@ -172,7 +172,7 @@ class ManiSkillBatch(BatchEnv):
         self._task, self._instruction, self._reconfigure = task, instruction, reconfigure
         self._playing = self._steps = 0
         self._simulator = _simulator(task, num_envs=num_envs, sim_backend=sim_backend, **options)
-        self._contract = self._simulator.contract(self._simulator.action)
+        self._contract = self._simulator.contract()
 
     @property
     def contract(self) -> Contract:

@@ -193,21 +193,15 @@ class ManiSkillRobot:
         self._finger_m = _FINGER_M.get(agent.uid)
         self.has_gripper = self._finger_m is not None
         self._fingers = np.array([names.index(name) for name in getattr(agent, "gripper_joint_names", ())], dtype=int)
-        self._has_tool = _tool(agent) is not None
-
-    @property
-    def gives(self) -> dict[str, StateSpec]:
-        parts = {"joints": StateSpec(dim=len(self._arm), unit="rad")}
-        if self._has_tool:
-            parts["tquat"] = StateSpec(dim=7, unit="m+quat_xyzw")
-            parts["xyzrpy"] = StateSpec(dim=6, unit="m+rad")
-        return parts
+        self.state = {"joints": StateSpec(len(self._arm), "rad")}
+        if _tool(agent) is not None:
+            self.state |= {"tquat": StateSpec(7, "m+quat_xyzw"), "xyzrpy": StateSpec(6, "m+rad")}
 
     def read(self, agent: Any) -> list[tuple[dict[str, np.ndarray], float | None]]:
         """Return the state of each environment, each part (D,) float32, and the gripper in [0, 1], 1 = open."""
         rows = agent.robot.get_qpos().cpu().numpy()
         states = [{"joints": qpos[self._arm]} for qpos in rows]
-        if self._has_tool:
+        if "tquat" in self.state:
             bases = agent.robot.pose.raw_pose.cpu().numpy()
             tools = _tool(agent).pose.raw_pose.cpu().numpy()
             for state, base, tool in zip(states, bases, tools, strict=True):
@@ -327,19 +321,16 @@ class Simulator:
             self.close()
             raise
 
-    @property
-    def action(self) -> ActionSpec:
-        env = self.alive()
-        return action_spec(env.control_mode, env.single_action_space, has_gripper=self._robot.has_gripper)
-
-    def contract(self, action: ActionSpec) -> Contract:
+    def contract(self, action: ActionSpec | None = None) -> Contract:
+        """Return the contract; `action` describes the actions, by default as ManiSkill's control mode has them."""
+        env, has_gripper = self.alive(), self._robot.has_gripper
         return Contract(
             cameras=self.cameras,
-            state=self._robot.gives,
-            gripper=self._robot.has_gripper,
+            state=self._robot.state,
+            gripper=has_gripper,
             instruction=True,
-            action=action,
-            control_hz=float(self.alive().control_freq),
+            action=action or action_spec(env.control_mode, env.single_action_space, has_gripper=has_gripper),
+            control_hz=float(env.control_freq),
         )
 
     def instructions(self) -> list[str]:

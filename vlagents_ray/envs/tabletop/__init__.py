@@ -32,7 +32,6 @@ _RENDERERS = {"front": TabletopRenderer, "wrist": WristRenderer}
 _TASKS: tuple[Task, ...] = get_args(Task)
 _DISTURBED = 0.1  # share of steps
 _VERSION = 1  # of the scenes and the physics; results of different versions are not comparable
-_CONTROL_HZ = 10.0
 _POINTING_DOWN = (math.pi, 0.0, 0.0)  # roll, pitch, yaw of the gripper in rad, constant
 
 
@@ -129,7 +128,7 @@ class Tabletop(EvalEnv):
             action=replace(
                 DELTA_POSE, dim=4, space="ee_position", rotation="none", gripper_open=1.0, gripper_closed=-1.0
             ),
-            control_hz=_CONTROL_HZ,
+            control_hz=10.0,
         )
 
     @property

@@ -246,12 +246,10 @@ class Goal:
             return puck is world.held and puck.z >= _LIFT_HEIGHT
         if puck is world.held:
             return False
+        x, y, z = self.place(world)
         if self.task == "stack":
-            below = world.puck(self.target)
-            near = math.hypot(puck.x - below.x, puck.y - below.y) < PUCK_RADIUS
-            return near and abs(puck.z - below.z - PUCK_HEIGHT) < 1e-3
-        pad = world.pad(self.target)
-        at_pad = abs(puck.x - pad.x) <= _AT_PAD and abs(puck.y - pad.y) <= _AT_PAD and puck.z < 1e-3
+            return math.hypot(puck.x - x, puck.y - y) < PUCK_RADIUS and abs(puck.z - z) < 1e-3
+        at_pad = abs(puck.x - x) <= _AT_PAD and abs(puck.y - y) <= _AT_PAD and puck.z < 1e-3
         return at_pad and not (self.task == "slide" and puck.lifted)
 
     def place(self, world: TabletopWorld) -> tuple[float, float, float]:

@@ -24,8 +24,6 @@ from vlagents_ray.errors import ConfigError, ConnectionLost, MalformedMessage, V
 from vlagents_ray.registry import require
 
 logger = logging.getLogger(__name__)
-_OPEN_S = 5.0
-_AGAIN_S = 0.5
 _SILENT_S = 2.0
 # The kernel's time limit for a send, which websockets lacks: a dead link would block the control loop for minutes.
 _SEND_LIMIT = struct.pack("@ll", 0, 200_000)
@@ -76,7 +74,6 @@ class Ros2:
         return True
 
     def close(self) -> None:
-        """End the node, and its thread."""
         self._context.try_shutdown()
         if self._thread is not None:
             self._thread.join()
@@ -176,7 +173,6 @@ class Rosbridge:
         return True
 
     def close(self) -> None:
-        """Close the connection, and end the thread."""
         self._closing.set()
         socket, self._socket = self._socket, None
         if socket is not None:
@@ -188,7 +184,7 @@ class Rosbridge:
     def _connect(self) -> None:
         self._open.close()  # the previous connection
         try:
-            opening = connect(self._url, compression=None, max_size=_LARGEST, open_timeout=_OPEN_S, close_timeout=1)
+            opening = connect(self._url, compression=None, max_size=_LARGEST, open_timeout=5, close_timeout=1)
             socket = self._open.enter_context(opening)
             socket.socket.setsockopt(SOL_SOCKET, SO_SNDTIMEO, _SEND_LIMIT)
             for topic, kind in self._outlets.items():
@@ -233,7 +229,7 @@ class Rosbridge:
         try:
             self._connect()
         except ConnectionLost:
-            self._closing.wait(_AGAIN_S)
+            self._closing.wait(0.5)
             return
         if self._closing.is_set() and (socket := self._socket) is not None:
             self._lose(socket)  # since `close` may have run before it was connected

@@ -26,7 +26,6 @@ from vlagents_ray.robot.safety import Watchdog
 from vlagents_ray.settings import require_arguments
 
 logger = logging.getLogger(__name__)
-_POLL_S = 0.01
 ROS2 = "ros2"
 IMAGE, COMPRESSED = "sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage"
 JOINT_STATE, BOOL = "sensor_msgs/msg/JointState", "std_msgs/msg/Bool"
@@ -454,7 +453,7 @@ class RosRobot:
                     f"{self.settings.link}: got no message of {missing} within {self.settings.ready_s:g} s, want one "
                     f"of each; compare names and types with `ros2 topic list --show-types`"
                 )
-            time.sleep(_POLL_S)
+            time.sleep(0.01)
         for reading in self.settings.sensors:
             ago_s = time.time() - self._readers[id(reading)].captured_at
             if not -SKEW_S <= ago_s <= reading.silent_s:
