@@ -150,9 +150,19 @@ def test_only_what_the_contract_offers_may_be_wanted(want: object, error: type[E
         {"action": {"arms": [1, 2]}},
         {"action": {"names": "pan"}},
         {"behaviour": "logprob"},
+        {"state": {"a": {"dim": "3"}}},
+        {"cameras": {"a": {"height": True}}},
+        {"action": {"low": "abc"}},
+        {"action": {"dim": 7.0}},
+        {"action": {"delta": 1}},
+        {"action": {"rotation": ["euler"]}},
+        {"action": {"space": 3}},
+        {"control_hz": {}},
+        {"chunk": "8"},
+        {"instruction": "yes"},
     ],
 )
-def test_an_unknown_key_in_a_contract_is_malformed(data: object) -> None:
+def test_an_unknown_key_or_a_value_of_another_type_in_a_contract_is_malformed(data: object) -> None:
     with pytest.raises(MalformedMessage):
         Contract.from_json(data)
 

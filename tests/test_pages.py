@@ -39,6 +39,7 @@ RUN = {"vlagents-ray doctor", "vlagents-ray policies"}
 # and these are not.
 NOT_RUN = {
     "vlagents-ray envs": "a block of docs/evaluation/index.md runs it",
+    "vlagents-ray serve noop --set delta=false": "it serves until Ctrl-C; test_teleoperation.py reads such a contract",
     "vlagents-ray serve noop --port 8000": "test_served_pages.py serves so what blocks of this page need",
     "vlagents-ray slurm eval": "the name of a command",
     "vlagents-ray robot --env tabletop --leader keyboard": "tests/cli/test_robot.py types its keys",

@@ -9,10 +9,11 @@ simulator that renders upside down rotates them.
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator, Mapping, Sequence
+import math
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, fields
 from itertools import combinations
-from typing import Any, Literal
+from typing import Any, Literal, TypeGuard, get_args
 
 import numpy as np
 
@@ -249,10 +250,34 @@ def require_match(policy: Contract | None, env: Contract | None, where: str = ""
 def closed(
     cls: type, data: object, where: str, error: type[MalformedMessage | ConfigError] = MalformedMessage
 ) -> dict[str, Any]:
-    """Return the entries of `data`; raise `error` unless it is a mapping with only fields of the dataclass `cls`."""
+    """Return the entries of `data`; raise `error` unless it is a mapping with only fields of the dataclass `cls`.
+
+    Fields that are numbers, texts or booleans are checked; the caller reads all others.
+    """
     if not isinstance(data, Mapping):
         raise error(f"{where}: got {type(data).__name__}, want an object")
-    known = [one.name for one in fields(cls)]
+    known = {one.name: str(one.type) for one in fields(cls)}
     if unknown := sorted(str(key) for key in data if key not in known):
         raise error(f"{where}: unknown keys {unknown}, want some of {sorted(known)}")
+    for name, value in data.items():
+        if not _FITS.get(known[name], lambda _: True)(value):
+            raise error(f"{where}.{name}: got {repr(value)[:80]}, want {known[name]}")
     return dict(data)
+
+
+def _number(value: object) -> TypeGuard[float]:
+    return type(value) in (int, float)
+
+
+_FITS: dict[str, Callable[[Any], bool]] = {  # by the type of a field
+    "str": lambda value: isinstance(value, str),
+    "str | None": lambda value: value is None or isinstance(value, str),
+    "int": lambda value: type(value) is int,
+    "int | None": lambda value: value is None or type(value) is int,
+    "float": lambda value: _number(value) and math.isfinite(value),
+    "float | None": lambda value: value is None or _number(value),
+    "bool": lambda value: isinstance(value, bool),
+    "bool | None": lambda value: value is None or isinstance(value, bool),
+    "Rotation | None": lambda value: value is None or value in get_args(Rotation),
+    "Literal['hwc', 'chw', 'any', 'rgba']": lambda value: value in ("hwc", "chw", "any", "rgba"),
+}

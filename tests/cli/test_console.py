@@ -114,7 +114,7 @@ def test_of_one_policy_all_is_said(shown: io.StringIO, monkeypatch: pytest.Monke
     assert shown.getvalue().splitlines() == [
         "noop: A policy that does nothing, in an adjustable time, to measure everything around a policy.",
         "  ready",
-        "  settings: action_dim=7, chunk=1, base_ms=0.0, per_item_ms=0.0",
+        "  settings: action_dim=7, delta=None, chunk=1, base_ms=0.0, per_item_ms=0.0",
     ]
     policies("openpi")
     assert "requirements/openpi.txt`" in shown.getvalue()

@@ -17,6 +17,7 @@ from eval_fakes import Clock
 from vlagents_ray import ActionSpec, ConfigError, Contract, Obs
 from vlagents_ray.envs import make_env
 from vlagents_ray.errors import MissingDependency, MissingState
+from vlagents_ray.policies.noop import Noop, NoopConfig
 from vlagents_ray.robot import run_loop
 from vlagents_ray.robot.simulated import EnvRobot
 from vlagents_ray.robot.teleoperation import AxesLeader, Keyboard, SpaceMouse, TeleoperatedAgent
@@ -150,9 +151,12 @@ def test_absolute_targets_begin_where_the_robot_stands_and_stay_within_the_bound
     assert leader.action(obs) == pytest.approx([0.4, 0.95, 0])
     with pytest.raises(MissingState):
         AxesLeader(JOINTS, stick, step=0.1).action(Obs())
-    for contract in (None, Contract(), Contract(action=ActionSpec(dim=7)), JOINTS):
-        with pytest.raises(ConfigError, match=r"teleoperation|step"):
-            AxesLeader(contract, stick)
+    for contract in (None, Contract(), Noop().contract):
+        with pytest.raises(ConfigError, match=r"teleoperation: .*delta.*--set delta=false"):
+            AxesLeader(contract, stick, step=0.1)
+    with pytest.raises(ConfigError, match="step"):
+        AxesLeader(JOINTS, stick)
+    AxesLeader(Noop(NoopConfig(delta=False)).contract, stick, step=0.1)
     measured = AxesLeader(JOINTS, stick, step=0.1, measure=lambda _: np.array([-0.5, 0, 0]))
     assert measured.action(Obs()) == pytest.approx([-0.6, 0.1, 0])
 
