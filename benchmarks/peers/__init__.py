@@ -100,7 +100,7 @@ PEER_CLIENTS = (
 PEERS = tuple(dict.fromkeys(one.peer for one in PEER_CLIENTS))
 Policy = Mapping[str, float]  # arguments of `peer.Policy`
 _NO_STATISTICS = "RAY_USAGE_STATS_ENABLED"
-READY_S = 240.0  # some import torch, or start Ray, several processes at once
+READY_S = 450.0  # some import torch, or start Ray, several processes at once
 
 
 def alone() -> dict[str, str | None]:

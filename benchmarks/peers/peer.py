@@ -41,7 +41,7 @@ else:  # the peers' Python has no vlagents_ray: files are loaded by their paths
 
 __all__ = ["Client", "Policy", "Target", "die_with_parent", "run", "wait_for_port"]
 
-_START_S = 180.0
+_START_S = 400.0
 
 if Path(sys.argv[0]).resolve().parent == Path(__file__).resolve().parent:  # also in processes that a script spawns
     die_with_parent()

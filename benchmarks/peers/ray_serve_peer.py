@@ -24,7 +24,7 @@ from ray import serve as ray_serve
 from starlette.requests import Request
 from starlette.responses import Response
 
-_START_S = 180.0
+_START_S = 400.0
 
 
 @ray_serve.deployment(max_ongoing_requests=128)
