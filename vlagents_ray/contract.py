@@ -279,5 +279,4 @@ _FITS: dict[str, Callable[[Any], bool]] = {  # by the type of a field
     "bool": lambda value: isinstance(value, bool),
     "bool | None": lambda value: value is None or isinstance(value, bool),
     "Rotation | None": lambda value: value is None or value in get_args(Rotation),
-    "Literal['hwc', 'chw', 'any', 'rgba']": lambda value: value in ("hwc", "chw", "any", "rgba"),
 }

@@ -244,7 +244,7 @@ def _link_files(folder: Path, stage: Path, results: Results, *, videos: bool) ->
             if videos:
                 paths += one.videos
             if one.trajectory is not None:
-                paths += [one.trajectory, *(storage.images_beside(folder, one.trajectory) if videos else ())]
+                paths += [one.trajectory, *(storage.trajectory_videos(folder, one.trajectory) if videos else ())]
     paths += [f"{storage.PROVENANCE}/{path.name}" for path in sorted((folder / storage.PROVENANCE).glob("*.diff"))]
     for path in dict.fromkeys(paths):
         source = storage.inside(folder, path)

@@ -212,7 +212,7 @@ def _link_files(merged: _Merged, out: Path, folders: Sequence[Path]) -> None:
         home = merged.home[key]
         paths: list[str] = json.loads(row["videos"])
         if row["trajectory"] is not None:
-            paths += [*storage.images_beside(home, row["trajectory"]), row["trajectory"]]
+            paths += [*storage.trajectory_videos(home, row["trajectory"]), row["trajectory"]]
         for path in paths:
             sources[out / path] = storage.require_there(storage.inside(home, path))
     for folder in folders:

@@ -27,7 +27,7 @@ from collections.abc import Callable, Iterator, Mapping
 from dataclasses import asdict, dataclass, field, fields
 from functools import lru_cache
 from itertools import islice
-from typing import Any, Literal, TypeVar
+from typing import Any, Literal, TypeVar, get_args
 
 import numpy as np
 
@@ -47,6 +47,7 @@ from vlagents_ray.protocol.values import as_camera, as_state, is_number
 
 logger = logging.getLogger(__name__)
 
+Layout = Literal["hwc", "chw", "any", "rgba"]
 T = TypeVar("T")
 
 
@@ -59,7 +60,7 @@ class CameraKey:
     """
 
     key: str
-    layout: Literal["hwc", "chw", "any", "rgba"] = "hwc"
+    layout: Layout = "hwc"
     optional: bool = False
 
 
@@ -115,6 +116,8 @@ def entry(cls: type[T], value: Any, where: str) -> T:
     known = [one.name for one in fields(cls)]  # type: ignore[arg-type]
     if "key" in known and not values.get("key"):
         raise ConfigError(f"{where}: no key; say where it lies in their observation")
+    if values.get("layout", "hwc") not in get_args(Layout):
+        raise ConfigError(f"{where}.layout: got {values['layout']!r}, want one of {get_args(Layout)}")
     if "*" in (key := values.get("key", "")) and key.index("*") != len(key) - 1:
         raise ConfigError(f"{where}: got key {key!r}, want '*' at its end alone")
     if "open" in known and values.get("open", 1.0) == values.get("closed", 0.0):

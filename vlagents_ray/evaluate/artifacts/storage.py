@@ -74,8 +74,8 @@ def inside(home: Path, path: str) -> Path:
     return found
 
 
-def images_beside(home: Path, trajectory: str) -> list[str]:
-    """Return the MP4s of the policy's images beside a trajectory in the folder of results `home`, relative to it."""
+def trajectory_videos(home: Path, trajectory: str) -> list[str]:
+    """Return the MP4s of a trajectory's images, relative to the folder of results `home`."""
     numbers = home / require_below(trajectory)
     return [str(path.relative_to(home)) for path in sorted(numbers.parent.glob(f"{escape(numbers.stem)}_*.mp4"))]
 

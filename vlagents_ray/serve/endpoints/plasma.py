@@ -86,7 +86,7 @@ class Pool:
 
     def __init__(self, limits: Limits) -> None:
         self._limits = limits
-        self._lock = threading.RLock()
+        self._lock = threading.Lock()
         self._free: list[Channel] = []
         self._leased: dict[bytes, Channel] = {}
         self._bytes = 0
@@ -105,7 +105,7 @@ class Pool:
         with self._lock:
             oldest = time.monotonic() - _CLAIM_S
             for lost in [key for key, channel in self._leased.items() if channel.leased < oldest]:
-                self.release(self._leased.pop(lost))
+                self._return_channel(self._leased.pop(lost))
             fitting = [channel for channel in self._free if channel.capacity >= length]
             if (channel := min(fitting, key=lambda one: one.capacity, default=None)) is not None:
                 self._free.remove(channel)
@@ -128,9 +128,12 @@ class Pool:
     def release(self, channel: Channel) -> None:
         """Return a channel to the pool, for the next client."""
         with self._lock:
-            if channel.intact():
-                self._free.append(channel)
-                return
+            self._return_channel(channel)
+
+    def _return_channel(self, channel: Channel) -> None:
+        if channel.intact():
+            self._free.append(channel)
+            return
         logger.warning(
             "plasma: a client was killed while it wrote; its channel of %d bytes is lost until this replica ends",
             channel.capacity,
