@@ -187,11 +187,43 @@ def test_errors_of_accelerators_are_told_apart(error: Exception, exhausted: bool
     assert (is_out_of_memory(error), is_device_failure(error)) == (exhausted, failed)
 
 
+ALLOCATION = "Failed to allocate memory for requested buffer of size 2147483648"
+CONVOLUTION = "Non-zero status code returned while running Conv node. Name:'/vision/conv' Status Message: "
+
+
+@pytest.mark.parametrize("name", ["Fail", "RuntimeException", "EPFail", "EngineError", "DeviceReset"])
+@pytest.mark.parametrize(
+    ("text", "exhausted", "failed"),
+    [
+        (f"6 : RUNTIME_EXCEPTION : {CONVOLUTION}/core/framework/bfc_arena.cc:376 {ALLOCATION}", True, False),
+        ("1 : FAIL : CUDA failure 2: out of memory ; GPU=0 ; expr=cudaMalloc((void**)&p, size);", True, False),
+        ("1 : FAIL : CUBLAS failure 3: CUBLAS_STATUS_ALLOC_FAILED ; GPU=0 ; hostname=robot", True, False),
+        ("1 : FAIL : CUDA failure 700: an illegal memory access was encountered ; GPU=0", False, True),
+        (f"1 : FAIL : {CONVOLUTION}CUDNN failure 8: CUDNN_STATUS_EXECUTION_FAILED ; GPU=0", False, True),
+        ("1 : FAIL : CUBLAS failure 13: the GPU program failed to execute ; GPU=0", False, True),
+        ("1 : FAIL : CUFFT failure 6: CUFFT_EXEC_FAILED ; GPU=0", False, True),
+        ("1 : FAIL : HIP failure 719: unspecified launch failure ; GPU=0", False, True),
+        ("16 : DEVICE_RESET : the device was removed", False, True),
+        ("2 : INVALID_ARGUMENT : Got invalid dimensions for input: images for the following indices", False, False),
+        ("1 : FAIL : the model of CUDA devices is not found", False, False),
+    ],
+)
+def test_errors_of_onnx_runtime_are_told_apart(name: str, text: str, exhausted: bool, failed: bool) -> None:
+    classes = pytest.importorskip("onnxruntime.capi.onnxruntime_pybind11_state")
+    error = getattr(classes, name)(f"[ONNXRuntimeError] : {text}")
+    assert not isinstance(error, RuntimeError), "otherwise the class of the error would need no rule"
+    assert (is_out_of_memory(error), is_device_failure(error)) == (exhausted, failed)
+    own = ValueError(str(error))  # a request's text is no error of a device
+    assert not is_out_of_memory(own)
+    assert not is_device_failure(own)
+
+
 class Crowded(ModelPolicy):
     """A model on a GPU whose memory holds a few rows; its actions are noise."""
 
     Config = ModelConfig
     fits = 3
+    exhausted: Exception = torch.OutOfMemoryError("CUDA out of memory. Tried to allocate 2.00 GiB.")
 
     @property
     def contract(self) -> Contract:
@@ -208,7 +240,7 @@ class Crowded(ModelPolicy):
         self.model["passes"].append(len(rows))
         noise = [row.noise(HORIZON, DIM) for row in rows]
         if len(rows) > self.fits:
-            raise torch.OutOfMemoryError("CUDA out of memory. Tried to allocate 2.00 GiB.")
+            raise self.exhausted
         return [Prediction(one) for one in noise]
 
 
@@ -302,6 +334,15 @@ def test_a_batch_that_does_not_fit_is_halved_and_acts_as_if_it_had(
     assert policy.model["passes"] == later
     for one, other in zip(acts, acted(made(Roomy), 5), strict=True):
         np.testing.assert_array_equal(one.action, other.action)
+
+
+def test_a_batch_that_onnx_runtime_cannot_fit_is_halved(monkeypatch: pytest.MonkeyPatch) -> None:
+    classes = pytest.importorskip("onnxruntime.capi.onnxruntime_pybind11_state")
+    monkeypatch.setattr(Crowded, "exhausted", classes.RuntimeException(f"6 : RUNTIME_EXCEPTION : {ALLOCATION}"))
+    policy = made(Crowded, max_rows=8)
+    for one, other in zip(acted(policy, 5), acted(made(Roomy), 5), strict=True):
+        np.testing.assert_array_equal(one.action, other.action)
+    assert policy.most_rows == 2
 
 
 def test_samples_that_do_not_fit_are_those_that_would_have_fitted() -> None:

@@ -31,9 +31,14 @@ GPU_SHARE = "VLAGENTS_RAY_GPU_SHARE"  # share of its GPU's memory that a process
 # https://docs.nvidia.com/deploy/cuda-compatibility/minor-version-compatibility.html
 OLDEST_DRIVERS = {12: 525, 13: 580}
 _DRIVER = Path("/proc/driver/nvidia/version")
-# Texts of errors of torch and of JAX, whose classes differ between their versions.
-_EXHAUSTED = re.compile(r"out of memory|ALLOC_FAILED|OUT_OF_MEMORY|RESOURCE_EXHAUSTED", re.IGNORECASE)
-_GPU_ERROR = re.compile(r"CUDA error|CUDA_ERROR_|CUDNN_STATUS_|CUBLAS_STATUS_|HIP error")
+# Texts of errors of torch, JAX and ONNX Runtime, whose classes differ between their versions.
+_EXHAUSTED = re.compile(
+    r"out of memory|ALLOC_FAILED|OUT_OF_MEMORY|RESOURCE_EXHAUSTED|Failed to allocate memory", re.IGNORECASE
+)
+_GPU_ERROR = re.compile(
+    r"CUDA error|CUDA_ERROR_|(?:CUDA|CUDNN|CUBLAS|CUFFT|HIP|MIOPEN|ROCBLAS) failure \d|CUDNN_STATUS_|CUBLAS_STATUS_"
+    r"|HIP error|DEVICE_RESET"
+)
 
 
 def torch_device(name: str = "auto") -> Any:
@@ -188,8 +193,8 @@ def fetch(tensor: Any) -> np.ndarray:
 
 
 def is_out_of_memory(error: BaseException) -> bool:
-    """Return whether an error of torch or JAX says that the memory of an accelerator is exhausted."""
-    return isinstance(error, RuntimeError) and bool(_EXHAUSTED.search(str(error)))
+    """Return whether a library's error says that the memory of an accelerator is exhausted."""
+    return _is_of_a_runtime(error) and bool(_EXHAUSTED.search(str(error)))
 
 
 def is_device_failure(error: BaseException) -> bool:
@@ -197,7 +202,12 @@ def is_device_failure(error: BaseException) -> bool:
 
     Such errors last: after an illegal access, or the loss of the device, each further call of the process fails.
     """
-    return isinstance(error, RuntimeError) and bool(_GPU_ERROR.search(str(error))) and not is_out_of_memory(error)
+    return _is_of_a_runtime(error) and bool(_GPU_ERROR.search(str(error))) and not is_out_of_memory(error)
+
+
+def _is_of_a_runtime(error: BaseException) -> bool:
+    """Return whether torch, JAX or ONNX Runtime may have raised an error; classes of the latter are no RuntimeError."""
+    return isinstance(error, RuntimeError) or type(error).__module__.partition(".")[0] == "onnxruntime"
 
 
 def free_memory() -> None:
