@@ -4,11 +4,11 @@
 export RAY_AUTH_MODE=token
 # HAProxy is Serve's ingress: a request goes from it straight to a replica, not through a Python proxy.
 export RAY_SERVE_ENABLE_HA_PROXY=1
-# An HTTP session stays on its replica by its header; whoever sends no headers is cut off after 15 s, and a WebSocket's
+# An HTTP session stays on its replica by its header; whoever sends no headers is cut off after 5 s, and a WebSocket's
 # silence is the replica's business. (Serve copies the value into HAProxy's settings, so further lines come with it.)
 export RAY_SERVE_HAPROXY_BALANCE_ALGORITHM='hdr(x-session-id)
     hash-type consistent sdbm avalanche
-    timeout http-request 15s
+    timeout http-request 5s
     timeout tunnel 24h
 '
 # HAProxy's files, and the socket by which Serve commands it, are in a folder that no other user of the machine enters:

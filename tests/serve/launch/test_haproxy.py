@@ -11,7 +11,7 @@ import time
 import urllib.error
 import urllib.request
 from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import ExitStack, contextmanager, suppress
 from http.client import HTTPConnection
 from http.server import BaseHTTPRequestHandler, HTTPServer, ThreadingHTTPServer
 from pathlib import Path
@@ -31,6 +31,7 @@ from vlagents_ray.errors import NoReplica, PolicyUnavailable
 from vlagents_ray.serve.launch.haproxy import (
     _CHECK_FAILURES,
     _CHECK_INTERVAL,
+    _CONNECTIONS_PER_ADDRESS,
     ROBOTS,
     _launcher,
     haproxy_binary,
@@ -40,6 +41,7 @@ from vlagents_ray.serve.ports import free_port
 
 pytestmark = pytest.mark.slow  # HAProxy's own timeouts have to pass
 
+MOST_CONNECTIONS = _CONNECTIONS_PER_ADDRESS + 50
 UP, DOWN = "http-app,SERVE_REPLICA::1,UP", "http-app,SERVE_REPLICA::1,DOWN"
 
 
@@ -94,8 +96,12 @@ def proxied(folder: Path, *servers: str, settings: str = "") -> Iterator[str]:
     with socket.create_server(("127.0.0.1", 0)) as silent:
         address = f"127.0.0.1:{silent.getsockname()[1]}"
         text = (
+            f"global\n    maxconn {MOST_CONNECTIONS}\n"
             "defaults\n    mode http\n    timeout connect 60s\n    timeout client 60s\n    timeout server 60s\n"
-            f"frontend f\n    bind 127.0.0.1:{port}\n    default_backend http-app\n"
+            f"frontend http_frontend\n    bind 127.0.0.1:{port}\n"
+            "    acl routes path -i /-/routes\n"
+            '    http-request return status 200 content-type text/plain string "all applications" if routes\n'
+            "    default_backend http-app\n"
             "backend http-app\n" + settings + "".join(f"    server {one}\n" for one in servers)
         )
         config.write_text(text.replace("ADDRESS", address))
@@ -227,6 +233,94 @@ def server_of(url: str, session: str) -> str:
         with urllib.request.urlopen(request, timeout=1) as answer:
             return str(answer.read().decode())
     return ""
+
+
+def answer_to(url: str, request: str, address: str = "127.0.0.1") -> bytes:
+    """The answer to a request as text, from an address of this machine."""
+    port = int(url.rpartition(":")[2])
+    with socket.create_connection(("127.0.0.1", port), 10, (address, 0)) as client:
+        client.sendall(request.encode())
+        return client.recv(65536)
+
+
+@contextmanager
+def upgrading() -> Iterator[tuple[str, list[dict[str, str]]]]:
+    """A replica's line in HAProxy's settings, and the headers of the requests that reach the replica."""
+    headers: list[dict[str, str]] = []
+
+    class Upgrade(BaseHTTPRequestHandler):
+        protocol_version = "HTTP/1.1"
+
+        def do_GET(self) -> None:
+            headers.append({name.lower(): value for name, value in self.headers.items()})
+            self.send_response(101)
+            self.send_header("connection", "upgrade")
+            self.send_header("upgrade", "websocket")
+            self.send_header("sec-websocket-accept", "s3pPLMBiTxaQ9kYGzzhZRbK+xOo=")  # for the key in UPGRADE
+            self.end_headers()
+
+        def log_message(self, *_: Any) -> None:
+            """Nothing."""
+
+    with ThreadingHTTPServer(("127.0.0.1", 0), Upgrade) as server:
+        threading.Thread(target=server.serve_forever).start()
+        try:
+            yield f"SERVE_REPLICA_app-Policy-1 127.0.0.1:{server.server_port}", headers
+        finally:
+            server.shutdown()
+
+
+@needs_haproxy
+def test_the_list_of_applications_is_hidden_in_each_encoding_of_its_path(tmp_path: Path) -> None:
+    plain = "/-/routes"
+    encoded = [f"{plain[:at]}%{ord(plain[at]):02x}{plain[at + 1 :]}" for at in range(1, len(plain))]
+    all_encoded = "/" + "".join(f"%{ord(character):02X}" for character in plain[1:])
+    with upgrading() as (replica, reached), proxied(tmp_path, replica) as url:
+        for path in [plain, "/-/ROUTES", "/-/routes?x=1", all_encoded, *encoded, *map(str.upper, encoded)]:
+            answer = answer_to(url, f"GET {path} HTTP/1.1\r\nhost: localhost\r\n\r\n")
+            assert answer.startswith(b"HTTP/1.1 404"), path
+        assert not reached
+
+
+HANDSHAKE = "GET /v1/stream HTTP/1.1\r\nhost: localhost\r\n" + "".join(
+    f"{name}: {value}\r\n" for name, value in UPGRADE.items()
+)
+
+
+@needs_haproxy
+def test_no_replica_is_offered_compression(tmp_path: Path) -> None:
+    offer = "Sec-WebSocket-Extensions: permessage-deflate; client_max_window_bits\r\n"
+    with upgrading() as (replica, reached), proxied(tmp_path, replica) as url:
+        assert answer_to(url, HANDSHAKE + offer + offer + "\r\n").startswith(b"HTTP/1.1 101")
+        assert "sec-websocket-extensions" not in reached[0]
+
+
+@needs_haproxy
+@pytest.mark.parametrize("more", ["Content-Length: 5\r\n\r\nhello", "Transfer-Encoding: chunked\r\n\r\n"])
+def test_a_handshake_with_a_body_is_refused_at_once(more: str, tmp_path: Path) -> None:
+    """A replica would never answer it."""
+    with upgrading() as (replica, reached), proxied(tmp_path, replica) as url:
+        assert answer_to(url, HANDSHAKE + more).startswith(b"HTTP/1.1 400")
+        assert not reached
+
+
+@needs_haproxy
+def test_one_address_does_not_take_all_connections(tmp_path: Path) -> None:
+    with upgrading() as (replica, _), proxied(tmp_path, replica) as url, ExitStack() as held:
+        port = int(url.rpartition(":")[2])
+        for _number in range(MOST_CONNECTIONS):
+            client = held.enter_context(socket.create_connection(("127.0.0.1", port), 10, ("127.0.0.2", 0)))
+            with suppress(OSError):  # HAProxy has closed it
+                client.sendall(b"GET /healthz HTTP/1.1\r\n")
+        assert answer_to(url, HANDSHAKE + "\r\n").startswith(b"HTTP/1.1 101")
+        held.close()
+
+        def is_let_in_again() -> bool:
+            with suppress(OSError):
+                return answer_to(url, HANDSHAKE + "\r\n", "127.0.0.2").startswith(b"HTTP/1.1 101")
+            return False
+
+        wait_for(is_let_in_again, 30)
 
 
 @needs_haproxy

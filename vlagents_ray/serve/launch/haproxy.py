@@ -9,6 +9,7 @@ from __future__ import annotations
 import csv
 import json
 import os
+import resource
 import shlex
 import shutil
 import ssl
@@ -35,6 +36,15 @@ _RETRY_AFTER_S = 1
 _REFUSAL = "no-replica.http"  # file name, in the folder of the script that starts HAProxy
 _CIPHERS = "ECDHE+AESGCM:ECDHE+CHACHA20"  # for TLS 1.2: with forward secrecy, without CBC
 _REPLICA_PORTS = 200  # size of the block of ports at which the replicas of one server listen
+_CONNECTIONS = 16384  # maximum number of connections, if the process may open that many
+_CONNECTIONS_PER_ADDRESS = 1000  # below a quarter of Serve's own maximum of 4096
+# Each connection of a client needs two descriptors, and one more for each where a listener is in front of Serve's port.
+_DESCRIPTORS_PER_CONNECTION = 4
+_LIMIT_PER_ADDRESS = (
+    "    stick-table type ipv6 size 100k expire 1m store conn_cur",
+    "    tcp-request connection track-sc0 src",
+    f"    tcp-request connection reject if {{ sc0_conn_cur gt {_CONNECTIONS_PER_ADDRESS} }}",
+)
 # HAProxy's settings on every Serve cluster that robots connect to. The files in cluster/ contain the same settings,
 # for clusters that are started in another way.
 ROBOTS = {
@@ -43,7 +53,7 @@ ROBOTS = {
     # joins or leaves affects only its own share of the sessions. Headers have a time limit; the replica limits the
     # silence of a WebSocket. Serve copies the value into HAProxy's settings, so it may contain further lines.
     _BALANCE: "hdr(x-session-id)\n    hash-type consistent sdbm avalanche\n"
-    "    timeout http-request 15s\n    timeout tunnel 24h\n",
+    "    timeout http-request 5s\n    timeout tunnel 24h\n",
     "RAY_SERVE_HAPROXY_TIMEOUT_CLIENT_S": "60",  # maximum pause of a client within a request
     # When replicas change, a new HAProxy takes over and the old one keeps its connections: for a day instead of two
     # minutes, after which it would close every robot's WebSocket.
@@ -120,7 +130,8 @@ class PublicListener:
         if self.client_ca is not None:
             tls += f' ca-file "{self.client_ca}" verify required'
         bind, server = f"bind {self.host}:{self.port}{tls}", f"server inside {LOOPBACK}:{self.inside}"
-        return f"listen outside\n    mode tcp\n    {bind}\n    {server}\n"
+        lines = ["listen outside", "    mode tcp", *_LIMIT_PER_ADDRESS, f"    {bind}", f"    {server}", ""]
+        return "\n".join(lines)
 
     def require(self) -> None:
         """Raise `ConfigError` if the environment, which the user may have set, lacks this listener's settings."""
@@ -158,7 +169,7 @@ def ingress_environment(folder: Path, binary: str, listener: PublicListener | No
     return {
         **ROBOTS,
         "RAY_SERVE_HTTP_PROXY_CALLBACK_IMPORT_PATH": "vlagents_ray.serve.endpoints.front:middlewares",
-        _BINARY: str(_launcher(folder, binary)),
+        _BINARY: str(_launcher(folder, binary, limit_addresses=listener is None)),
         "RAY_SERVE_HAPROXY_METRICS_SOCKET_PATH": str(folder / "metrics"),
         "RAY_SERVE_HAPROXY_CONFIG_FILE_LOC": str(folder / "haproxy.cfg"),
         "RAY_SERVE_HAPROXY_SOCKET_PATH": str(folder / "admin"),  # short, as a socket's path must be
@@ -167,6 +178,7 @@ def ingress_environment(folder: Path, binary: str, listener: PublicListener | No
         "RAY_SERVE_HAPROXY_METRICS_PORT": str(metrics),
         "RAY_SERVE_HAPROXY_STATS_PORT": str(stats),
         "RAY_SERVE_HAPROXY_NBTHREAD": "2",
+        "RAY_SERVE_HAPROXY_MAXCONN": str(_most_connections()),
         _BALANCE: ROBOTS[_BALANCE] + ("" if listener is None else listener.settings()),
         "RAY_SERVE_DIRECT_INGRESS_MIN_HTTP_PORT": str(replicas),
         "RAY_SERVE_DIRECT_INGRESS_MAX_HTTP_PORT": str(replicas + _REPLICA_PORTS),
@@ -174,11 +186,23 @@ def ingress_environment(folder: Path, binary: str, listener: PublicListener | No
     }
 
 
-def _launcher(folder: Path, binary: str, *, alone: bool = True) -> Path:
+def _most_connections() -> int:
+    """Return the maximum number of connections; HAProxy does not start if it may not open enough descriptors."""
+    _, most_descriptors = resource.getrlimit(resource.RLIMIT_NOFILE)
+    if most_descriptors == resource.RLIM_INFINITY:
+        return _CONNECTIONS
+    return min(_CONNECTIONS, most_descriptors // _DESCRIPTORS_PER_CONNECTION)
+
+
+def _launcher(folder: Path, binary: str, *, alone: bool = True, limit_addresses: bool = True) -> Path:
     """Write a script that starts HAProxy, with settings that Serve cannot express, and return its path.
 
     If the server is `alone` on its Ray, metrics and statistics are on loopback, and the list of applications
-    (`/-/routes`) is hidden.
+    (`/-/routes`) is hidden, in each of its encodings. `limit_addresses` is whether Serve's own port bounds the
+    connections of one address; a `PublicListener` in front of that port does it itself.
+
+    No WebSocket is compressed, since a replica would inflate a message before any limit applies. A handshake has no
+    body, as a replica would never answer it.
 
     If an application has no replica, Serve would hold its requests until there is one. Here they are held briefly, so
     that an application scaled to zero starts a replica, and then get 503; WebSockets wait.
@@ -201,7 +225,17 @@ def _launcher(folder: Path, binary: str, *, alone: bool = True) -> Path:
         rf"s/^( *bind )[*]?:([0-9]+)$/\1{LOOPBACK}:\2/",
         r"s/^( *http-request ).* if routes$/\1deny deny_status 404 if routes/",
     )
+    is_handshake = "{ req.hdr(upgrade) -m found }"
+    front = (
+        *(_LIMIT_PER_ADDRESS if limit_addresses else ()),
+        "    http-request del-header sec-websocket-extensions",
+        f"    http-request deny deny_status 400 if {is_handshake} {{ req.hdr_val(content-length) gt 0 }}",
+        f"    http-request deny deny_status 400 if {is_handshake} {{ req.hdr(transfer-encoding) -m found }}",
+    )
+    front_lines = r"\n".join(front)
     changes = (
+        rf"s/^frontend http_frontend$/&\n{front_lines}/",
+        r"s/^( *acl [a-z_]+ path) -i/\1,url_dec -i/",
         *(closed if alone else ()),
         rf"s|^backend .*$|&\n    errorfile 503 {refusal}\n    errorfile 504 {refusal}|",
         r"s/^backend .*$/&\n    acl replica_up always_false/",
