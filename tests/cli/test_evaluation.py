@@ -206,7 +206,7 @@ def test_a_dry_run_keeps_warnings_of_what_is_meant_off_the_terminal(
 ) -> None:
     warnings = ("Token authentication is enabled for this Ray cluster", "the disk is almost full")
 
-    def measure(_config: EvalConfig) -> None:
+    def measure(_config: EvalConfig, _address: str | None) -> None:
         for line in warnings:
             logging.getLogger("ray._private.worker").warning(line)
 
@@ -258,5 +258,5 @@ def test_the_plan_is_printed_without_asking_any_policy(
     assert "20 episodes, 0 of them finished" in text
     assert "policy@20" in text
     assert "unknown time" in text
-    assert "; 4 of 4 cells were not played yet" in " ".join(text.split())
+    assert "; not played yet: 4 of 4 cells" in " ".join(text.split())
     assert not settings.out.exists(), "nothing is written"

@@ -101,8 +101,9 @@ REFUSED: Mapping[str, tuple[dict[str, object], list[str], str]] = {
 }
 
 
+@pytest.mark.parametrize("more", [[], ["--dry-run"]], ids=["run", "dry run"])
 @pytest.mark.parametrize("why", REFUSED)
-def test_what_only_ray_can_do_is_refused(why: str, folder: Path) -> None:
+def test_what_only_ray_can_do_is_refused(why: str, folder: Path, more: list[str]) -> None:
     policy, words, text = REFUSED[why]
     packages = deployment(policy="noop")
     packages["applications"][0]["runtime_env"] = {"pip": ["einops"]}  # type: ignore[index]
@@ -111,9 +112,45 @@ def test_what_only_ray_can_do_is_refused(why: str, folder: Path) -> None:
     if why == "worker":
         plan["worker"] = {"runtime_env": {"pip": ["einops"]}}  # type: ignore[assignment]
     (folder / "runs.yaml").write_text(yaml.safe_dump(plan))
-    done = CliRunner().invoke(app, ["eval", "runs.yaml", *words], env={"COLUMNS": "300"})
+    done = CliRunner().invoke(app, ["eval", "runs.yaml", *words, *more], env={"COLUMNS": "300"})
     assert done.exit_code == 2, done.output
     assert text in done.stderr
+    assert not (folder / "runs").exists()
+
+
+WAYS = {
+    "none": ({}, [], 0),
+    "0": ({"workers": 0}, [], 0),
+    "1": ({"workers": 1}, [], 1),
+    "3": ({"workers": 3}, [], 3),
+    "long": ({"suites": [{"envs": [LINE], "episodes": 1000}]}, [], 1),
+    "packages": ({"policies": [{"source": "packages.yaml"}]}, [], 1),
+    "gpu": ({"policies": [{"source": "gpu.yaml"}]}, [], 1),
+    "address": ({}, ["--address", "auto"], 1),
+    "url": ({"policies": [{"url": "http://127.0.0.1:9"}]}, [], 0),
+}
+
+
+@pytest.mark.parametrize("way", WAYS)
+def test_a_dry_run_names_the_workers_with_which_the_run_itself_is_played(
+    way: str, folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Also of a policy by name, which becomes an address in a cluster while the plan is made."""
+    changes, words, workers = WAYS[way]
+    for name, more in (
+        ("packages", {"runtime_env": {"pip": ["einops"]}}),
+        ("gpu", {"args": {"policy": "noop", "resources": {"num_gpus": 1}}}),
+    ):
+        config = deployment(policy="noop")
+        config["applications"][0] |= more  # type: ignore[index]
+        (folder / f"{name}.yaml").write_text(yaml.safe_dump(config))
+    plan = {"policies": [{"source": "noop"}], "suites": [{"envs": [LINE], "episodes": 4}]} | changes
+    (folder / "runs.yaml").write_text(yaml.safe_dump(plan))
+    done = CliRunner().invoke(app, ["eval", "runs.yaml", "--dry-run", *words], env={"COLUMNS": "300"})
+    assert done.exit_code == 0, done.output
+    where = {0: "in one process, without Ray", 1: "with 1 worker;", 3: "with 3 workers;"}[workers]
+    assert where in done.stdout
+    assert "1 cell: 1 policy at each checkpoint x 1 environment of suites" in done.stdout
     assert not (folder / "runs").exists()
 
 

@@ -8,6 +8,16 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from vlagents_ray.bounds import (
+    MOST_CPUS,
+    MOST_EPISODES,
+    MOST_RETRIES,
+    MOST_ROWS,
+    MOST_S,
+    MOST_SEED,
+    MOST_STEP,
+    MOST_WORKERS,
+)
 from vlagents_ray.cli.console import errors
 from vlagents_ray.cli.options import (
     YAML_SUFFIXES,
@@ -16,6 +26,7 @@ from vlagents_ray.cli.options import (
     LiveAt,
     Set,
     command_of,
+    finite,
     parse_list,
     parse_settings,
     parse_time,
@@ -45,23 +56,40 @@ class EvalOptions:
     ]
     source: Annotated[str | None, typer.Option("--policy", help="Registered name, deployment file, or URL.")] = None
     out: Annotated[Path | None, typer.Option("--out", help="Folder of the results.")] = None
-    episodes: Annotated[int | None, typer.Option(min=1, help="Episodes of each environment; default: 10.")] = None
+    episodes: Annotated[
+        int | None, typer.Option(min=1, max=MOST_EPISODES, help="Episodes of each environment; default: 10.")
+    ] = None
     workers: Annotated[
         int | None,
         typer.Option(
             min=0,
+            max=MOST_WORKERS,
             help="Environments played in parallel; 0: in this process, without Ray. Default: 0 if short, else 1.",
         ),
     ] = None
     cpus: Annotated[
         float | None,
-        typer.Option("--worker-cpus", min=0, help="CPUs of each worker, unless the file says how many; default: 0.5."),
+        typer.Option(
+            "--worker-cpus",
+            min=0,
+            max=MOST_CPUS,
+            callback=finite,
+            help="CPUs of each worker, unless the file says how many; default: 0.5.",
+        ),
     ] = None
     gpus: Annotated[
         float | None,
-        typer.Option("--worker-gpus", min=0, help="GPUs per worker to render on, such as 0.25; default: 0 (software)."),
+        typer.Option(
+            "--worker-gpus",
+            min=0,
+            max=MOST_CPUS,
+            callback=finite,
+            help="GPUs per worker to render on, such as 0.25; default: 0 (software).",
+        ),
     ] = None
-    seeds: Annotated[int | None, typer.Option("--seed", min=0, help="Episode i uses seed + i; default: 0.")] = None
+    seeds: Annotated[
+        int | None, typer.Option("--seed", min=0, max=MOST_SEED, help="Episode i uses seed + i; default: 0.")
+    ] = None
     video: Annotated[str | None, typer.Option(help="none, failures (default) or all.")] = None
     record: Annotated[str | None, typer.Option(help="Trajectories: none (default), failures or all.")] = None
     track: Annotated[str, typer.Option(help="wandb, trackio, tensorboard, with commas between them.")] = ""
@@ -70,8 +98,12 @@ class EvalOptions:
         bool,
         typer.Option("--accept-changes", help="With --resume: although files or weights changed; the report says so."),
     ] = False
-    execute: Annotated[int | None, typer.Option(min=1, help="Rows executed of each chunk; default: all.")] = None
-    retries: Annotated[int | None, typer.Option(min=0, help="Attempts after a lost one; default: 3.")] = None
+    execute: Annotated[
+        int | None, typer.Option(min=1, max=MOST_ROWS, help="Rows executed of each chunk; default: all.")
+    ] = None
+    retries: Annotated[
+        int | None, typer.Option(min=0, max=MOST_RETRIES, help="Attempts after a lost one; default: 3.")
+    ] = None
     config: Set = field(default_factory=list)
     env_options: Annotated[
         list[str], typer.Option("--env-set", metavar="KEY=VALUE", help="An option of the environments: width=256.")
@@ -84,8 +116,18 @@ class EvalOptions:
         Path | None,
         typer.Option(metavar="DIR", help="Evaluate each checkpoint that a training run writes there, until Ctrl-C."),
     ] = None
-    until: Annotated[int | None, typer.Option(min=0, metavar="STEP", help="End --watch with this step.")] = None
-    settle_s: Annotated[float | None, typer.Option(min=0, help="With --watch: without a change; default: 10.")] = None
+    until: Annotated[
+        int | None, typer.Option(min=0, max=MOST_STEP, metavar="STEP", help="End --watch with this step.")
+    ] = None
+    settle_s: Annotated[
+        float | None,
+        typer.Option(
+            min=0,
+            max=MOST_S,
+            callback=finite,
+            help="With --watch: a checkpoint is complete after this time without a change; default: 10.",
+        ),
+    ] = None
     marker: Annotated[str | None, typer.Option(metavar="NAME", help="With --watch: the trainer's last file.")] = None
     dry_run: Annotated[bool, typer.Option("--dry-run", help="Print the plan, and the time left; play nothing.")] = False
     end_at: Annotated[
@@ -160,7 +202,7 @@ def evaluate_command(options: EvalOptions) -> None:
             run_on_robot(config, address, operator=options.operator or "page", unblinded=options.unblind)
         elif options.dry_run:
             with quiet_ray(None):
-                print_plan(config)
+                print_plan(config, address)
         elif options.watch is not None:
             settle_s = 10.0 if options.settle_s is None else options.settle_s
             watch_training(

@@ -17,7 +17,7 @@ from rich.table import Table
 
 from vlagents_ray.cli.console import fail, out
 from vlagents_ray.cli.listing import require_packages
-from vlagents_ray.cli.policies import Agents, policy_deployment, resolve_policies, served
+from vlagents_ray.cli.policies import Agents, planned_workers, policy_deployment, resolve_policies, served
 from vlagents_ray.errors import ConfigError, PolicyFailed
 from vlagents_ray.evaluate import (
     EvalConfig,
@@ -32,12 +32,10 @@ from vlagents_ray.evaluate import (
 )
 from vlagents_ray.evaluate.checkpoint_watcher import CheckpointWatcher, rounds
 from vlagents_ray.evaluate.plan.cases import EvalCase, cells
-from vlagents_ray.evaluate.plan.jobs import plan
 from vlagents_ray.evaluate.report.results_document import ProgressDocument, ResultsDocument
 from vlagents_ray.evaluate.report.terminal import LineProgress
 from vlagents_ray.evaluate.results.database import FILE
 from vlagents_ray.evaluate.results.summary import errors_of_policies, failing_cells, summarize
-from vlagents_ray.evaluate.workers.base import chosen_workers
 from vlagents_ray.policies.base.checkpoint import STEP
 from vlagents_ray.ray_tools.private import node_of_this_process
 from vlagents_ray.serve.access.api_keys import load_keys
@@ -291,9 +289,11 @@ class Forecast:
     seconds: float | None  # mean time of its policy's episodes in its env; None: not known
 
 
-def print_plan(config: EvalConfig) -> None:
+def print_plan(config: EvalConfig, address: str | None = None) -> None:
     """Print a row for each cell, and the sum. Nothing is served, played or written."""
-    config, _ = resolve_policies(config, ask=False)
+    stated = config
+    config, parts = resolve_policies(stated, ask=False)
+    workers = planned_workers(stated, parts, address)
     results = Results.load(config.out) if (config.out / FILE).is_file() else None
     found = forecasts(cells(config), results)
     shown = Table(box=SIMPLE_HEAD, padding=0, pad_edge=False)
@@ -317,13 +317,13 @@ def print_plan(config: EvalConfig) -> None:
     planned, finished = sum(case.planned for case in cases), sum(one.finished for one in found)
     left = sum(one.left for one in found)
     # Workers share one queue, so that at most one episode's time is lost at the end.
-    workers = chosen_workers(config)
     seconds = sum(one.left * (one.seconds or 0.0) for one in found) / max(1, min(workers, left))
     unknown = sum(one.seconds is None for one in found)
-    beside = f"; {unknown} of {len(found)} cells were not played yet" if unknown else ""
-    out.print(f"{len(found)} cells: {policies} policies at their checkpoints x {envs} environments of suites")
-    out.print(f"{planned} episodes, {finished} of them finished in {config.out}, {left} to play")
-    where = f"with {workers} workers" if workers else "in one process, without Ray"
+    beside = f"; not played yet: {unknown} of {counted(len(found), 'cell')}" if unknown else ""
+    factors = f"{counted(policies, 'policy', 'policies')} at each checkpoint x {counted(envs, 'environment')} of suites"
+    out.print(f"{counted(len(found), 'cell')}: {factors}")
+    out.print(f"{counted(planned, 'episode')}, {finished} of them finished in {config.out}, {left} to play")
+    where = f"with {counted(workers, 'worker')}" if workers else "in one process, without Ray"
     time = "unknown time" if unknown == len(found) else f"{_time(seconds)} as by earlier episodes"
     out.print(f"{time} {where}{beside}")
 
@@ -336,13 +336,19 @@ def forecasts(planned: Sequence[EvalCase], results: Results | None) -> list[Fore
         same = next((one for one in earlier if (one.contender, one.suite, one.env) == cell.name), None)
         recorded = [] if same is None else [one.result for one in same.episodes]
         done = {(one.key.episode, one.key.seed) for one in recorded if one.status != "infra_failed"}
-        finished = sum((job.key.episode, job.key.seed) in done for job in plan([cell]))
+        planned_seeds = set(cell.suite.seeds)
+        finished = sum(episode < cell.suite.episodes and seed - episode in planned_seeds for episode, seed in done)
         has_stopped = same is not None and same.stopped_at is not None
         alike = [one for one in earlier if (one.policy, one.env) == (cell.policy.name, cell.env)]
         seconds = [episode.seconds for one in alike for episode in one.counted]
         mean = sum(seconds) / len(seconds) if seconds else None
         found.append(Forecast(cell, finished, 0 if has_stopped else cell.planned - finished, mean))
     return found
+
+
+def counted(number: int, noun: str, plural: str | None = None) -> str:
+    """Return "1 cell", or "2 cells"."""
+    return f"{number} {noun if number == 1 else plural or noun + 's'}"
 
 
 def _time(seconds: float) -> str:

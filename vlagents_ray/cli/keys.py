@@ -11,6 +11,7 @@ import typer
 from rich.text import Text
 
 from vlagents_ray.cli.console import err, errors, out, table
+from vlagents_ray.cli.options import finite
 from vlagents_ray.errors import ConfigError
 from vlagents_ray.serve.access.api_keys import FILE_VARIABLE
 from vlagents_ray.serve.access.key_store import new_key, read_keys, revoke
@@ -27,14 +28,21 @@ def new(
     name: Name,
     file: File = None,
     app: Annotated[list[str], typer.Option(help="An application that it is for, repeatable; default: all.")] = [],  # noqa: B006
-    rate: Annotated[float | None, typer.Option(help="Requests a second, at each replica.")] = None,
-    sessions: Annotated[int | None, typer.Option(min=1, help="Sessions held at once, at each replica.")] = None,
+    rate: Annotated[
+        float | None, typer.Option(min=0.001, max=1e6, callback=finite, help="Requests a second, at each replica.")
+    ] = None,
+    sessions: Annotated[
+        int | None, typer.Option(min=1, max=1_000_000, help="Sessions held at once, at each replica.")
+    ] = None,
     rank: Annotated[str | None, typer.Option(help="'simulation': none of its requests goes before a robot's.")] = None,
     scope: Annotated[
         list[str],
         typer.Option(help="What else it may: 'weights' push, 'watch' all sessions, 'operate' them; repeatable."),
     ] = [],  # noqa: B006
-    days: Annotated[float | None, typer.Option(help="It expires after so many days.")] = None,
+    days: Annotated[
+        float | None,
+        typer.Option(min=0.001, max=36_500, callback=finite, help="It expires after this number of days."),
+    ] = None,
 ) -> None:
     """Make a key. It is shown this once; the file keeps its hash."""
     with errors():

@@ -73,7 +73,7 @@ def demo(out_dir: Annotated[Path, typer.Option("--out", help="Folder of the resu
 
 @app.command(short_help="Check this machine: Python, Ray, GPU, ports; each with the cure.")
 def doctor(
-    port: Annotated[int, typer.Option(help="The port that a server would take.")] = 8000,
+    port: Annotated[int, typer.Option(min=1, max=65535, help="The port that a server would take.")] = 8000,
     python: Annotated[list[Path], typer.Option(help="A policy's Python, repeatable; default: in .venv-*.")] = [],  # noqa: B006
     as_json: AsJson = False,
 ) -> None:

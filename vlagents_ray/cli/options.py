@@ -7,14 +7,15 @@ import dataclasses
 import datetime
 import functools
 import inspect
+import math
 from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Annotated, Any, TypeVar, get_type_hints
 
 import typer
-import yaml
 
 from vlagents_ray.errors import ConfigError
+from vlagents_ray.yaml_text import load_yaml, read_yaml
 
 YAML_SUFFIXES = (".yaml", ".yml")
 
@@ -39,6 +40,7 @@ LiveAt = Annotated[
 StateDims = Annotated[
     list[str], typer.Option("--state-dim", metavar="PART=N", help="Numbers in a part, where the policy does not say.")
 ]
+_MOST_DIMS = 1_000_000  # numbers in a part of the state
 _Options = TypeVar("_Options")
 
 
@@ -67,6 +69,13 @@ def command_of(options: type[_Options]) -> Callable[[Callable[[_Options], None]]
     return decorate
 
 
+def finite(value: float | None) -> float | None:
+    """Return the value of an option, for Typer, whose bounds accept a number that is not one; that is an error here."""
+    if value is not None and not math.isfinite(value):
+        raise typer.BadParameter(f"expected a finite number, got {value}")
+    return value
+
+
 def parse_settings(texts: Iterable[str], option: str) -> dict[str, Any]:
     """Parse `a.b=1` and the like to nested settings; the value is YAML, so `[1, 2]` and `true` work.
 
@@ -84,8 +93,8 @@ def parse_settings(texts: Iterable[str], option: str) -> dict[str, Any]:
             if not isinstance(place, dict):
                 raise ConfigError(f"{option}: {key!r} goes below {name!r}, which has a value already")
         try:
-            place[path[-1]] = yaml.safe_load(value)
-        except yaml.YAMLError as error:
+            place[path[-1]] = load_yaml(value)
+        except ValueError as error:
             if not value.lstrip().startswith(("[", "{", '"', "'")):
                 place[path[-1]] = value
                 continue
@@ -96,8 +105,8 @@ def parse_settings(texts: Iterable[str], option: str) -> dict[str, Any]:
 def parse_dims(texts: Iterable[str], option: str) -> dict[str, int]:
     """Parse `PART=N`, the numbers in parts of the state."""
     dims = parse_settings(texts, option)
-    if not all(isinstance(number, int) and number > 0 for number in dims.values()):
-        raise ConfigError(f"{option}: got {dims}, want a number from 1 on for each part")
+    if not all(type(number) is int and 1 <= number <= _MOST_DIMS for number in dims.values()):
+        raise ConfigError(f"{option}: expected a whole number from 1 to {_MOST_DIMS} for each part, got {dims}")
     return dims
 
 
@@ -108,22 +117,21 @@ def parse_list(text: str) -> list[str]:
 
 def parse_time(text: str, option: str) -> float:
     """Parse seconds since 1970, or a date and time of day (local unless it has a zone), to seconds since 1970."""
-    with contextlib.suppress(ValueError):
-        return float(text)
     try:
+        with contextlib.suppress(ValueError):
+            return datetime.datetime.fromtimestamp(float(text)).timestamp()  # within the calendar
         return datetime.datetime.fromisoformat(text).timestamp()
-    except ValueError as error:
-        raise ConfigError(f"{option}: got {text!r}, want seconds since 1970, or as in 2027-01-31T18:30") from error
+    except (ValueError, OverflowError, OSError) as error:
+        raise ConfigError(
+            f"{option}: expected seconds since 1970, or a time such as 2027-01-31T18:30, got {text!r}"
+        ) from error
 
 
 def read_run_file(file: Path, kind: str, keys: str) -> dict[str, Any]:
     """Read a YAML file of the settings of a run; results go to runs/NAME unless it names a folder."""
     if not file.is_file():
         raise ConfigError(f"{kind} {str(file)!r} does not exist")
-    try:
-        document = yaml.safe_load(file.read_text())
-    except yaml.YAMLError as error:
-        raise ConfigError(f"{file}: not YAML ({error})") from error
+    document = read_yaml(file)
     if not isinstance(document, dict):
         raise ConfigError(f"{file}: got {type(document).__name__}, want a mapping with {keys}")
     return {"out": Path("runs") / file.stem} | document

@@ -54,8 +54,7 @@ def served(
         The evaluation with its number of workers and the URLs of its policies; and, without workers, the agents of the
         policies that are not at a URL.
     """
-    if config.workers == 0 and address is not None:
-        raise ConfigError("workers: got 0 with --address, want 1 or more in a cluster, or no --address")
+    _require_cluster_workers(config, address)
     with contextlib.ExitStack() as stack:
         on_ray = address is not None or config.real_robot is not None or chosen_workers(config) > 0
         if on_ray:
@@ -78,6 +77,23 @@ def served(
         if parts:
             stack.enter_context(_on_ray(ready, parts, address, replica_per_gpu=replica_per_gpu))
         yield ready, {}
+
+
+def planned_workers(config: EvalConfig, parts: Mapping[str, Deployment], address: str | None = None) -> int:
+    """Return the number of workers with which `served` would play `config`, whose policies became `parts`.
+
+    Raises `ConfigError` where `served` does: `workers` is 0, and something needs Ray.
+    """
+    _require_cluster_workers(config, address)
+    workers = chosen_workers(config)
+    if workers or address is not None or _local_policies(parts, config.workers) is None:
+        return workers or 1
+    return 0
+
+
+def _require_cluster_workers(config: EvalConfig, address: str | None) -> None:
+    if config.workers == 0 and address is not None:
+        raise ConfigError("workers: got 0 with --address, want 1 or more in a cluster, or no --address")
 
 
 def _require_resources(config: EvalConfig, parts: Mapping[str, Deployment]) -> None:

@@ -9,8 +9,9 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from vlagents_ray.bounds import MOST_EPISODES, MOST_ROWS
 from vlagents_ray.cli.console import errors, fresh, out, print_json, table
-from vlagents_ray.cli.options import Address, AsJson, Live, LiveAt, parse_list, parse_settings
+from vlagents_ray.cli.options import Address, AsJson, Live, LiveAt, finite, parse_list, parse_settings
 from vlagents_ray.errors import ConfigError
 
 if TYPE_CHECKING:
@@ -141,10 +142,14 @@ def bundle_command(
 
 def verify_command(
     bundle: Annotated[Path, typer.Argument(metavar="BUNDLE", help="A file that `vlagents-ray bundle` wrote.")],
-    replay: Annotated[int, typer.Option(min=0, help="Episodes whose recorded actions are played again.")] = 3,
+    replay: Annotated[
+        int, typer.Option(min=0, max=MOST_EPISODES, help="Episodes whose recorded actions are played again.")
+    ] = 3,
     into: Annotated[Path | None, typer.Option("--out", help="Keep its results in this new folder.")] = None,
     trust: Annotated[bool, typer.Option("--trust", help="Also make environments that name code or files.")] = False,
-    max_gb: Annotated[float, typer.Option(min=0, help="Refuse a bundle that unpacks to more.")] = 16.0,
+    max_gb: Annotated[
+        float, typer.Option(min=0, max=1e6, callback=finite, help="Refuse a bundle that unpacks to more.")
+    ] = 16.0,
     as_json: AsJson = False,
 ) -> None:
     """Check a bundle, also a stranger's, and print what is equal, differs, or could not be checked.
@@ -178,9 +183,13 @@ def replay_command(
     out_dir: Annotated[Path | None, typer.Option("--out", help="Folder of the replay; default: a new one.")] = None,
     address: Address = None,
     only: Annotated[str | None, typer.Option(help="Of a dataset: episodes, as 0-9,12. Default: all.")] = None,
-    horizon: Annotated[int | None, typer.Option(min=1, help="Of a dataset: rows of a chunk that are compared.")] = None,
-    every: Annotated[int, typer.Option(min=1, help="Of a dataset without answers: each so many-th frame.")] = 1,
-    at_once: Annotated[int, typer.Option(min=1, help="Of a dataset: episodes that share a batch.")] = 8,
+    horizon: Annotated[
+        int | None, typer.Option(min=1, max=MOST_ROWS, help="Of a dataset: rows of a chunk that are compared.")
+    ] = None,
+    every: Annotated[
+        int, typer.Option(min=1, max=MOST_EPISODES, help="Of a dataset without answers: each so many-th frame.")
+    ] = 1,
+    at_once: Annotated[int, typer.Option(min=1, max=MOST_ROWS, help="Of a dataset: episodes that share a batch.")] = 8,
     camera_map: Annotated[str | None, typer.Option(help="Of a dataset: POLICY=DATASET, as base=top.")] = None,
     state: Annotated[str | None, typer.Option(help="Of a dataset: parts of observation.state in order.")] = None,
 ) -> None:
@@ -246,5 +255,8 @@ def parse_episodes(text: str) -> Sequence[int]:
         first, dash, last = part.partition("-")
         if not first.isdecimal() or (dash and not last.isdecimal()):
             raise ConfigError(f"--only: got {part!r}, want numbers and ranges, such as 0-9,12")
-        found += range(int(first), int(last or first) + 1)
+        numbers = range(int(first), int(last or first) + 1)
+        if not numbers or len(found) + len(numbers) > MOST_EPISODES:
+            raise ConfigError(f"--only: expected up to {MOST_EPISODES} numbers, from low to high, got {part!r}")
+        found += numbers
     return found

@@ -9,8 +9,10 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from vlagents_ray.bounds import MOST_RETRIES, MOST_S
 from vlagents_ray.cli.console import errors, out
 from vlagents_ray.cli.evaluate import EvalOptions, config_from_options, evaluate_command
+from vlagents_ray.cli.options import finite
 from vlagents_ray.cli.serve import serve_command
 from vlagents_ray.errors import ConfigError
 from vlagents_ray.slurm.submission import Script, first_index, split, submit
@@ -33,8 +35,12 @@ Setup = Annotated[Path | None, typer.Option(help="File of shell lines that the j
 @slurm.command("eval", context_settings=_BOTH, options_metavar="{FILE | ENV...} [OPTIONS]")
 def eval_(
     context: typer.Context,
-    resubmit: Annotated[int, typer.Option(min=0, help="Times that the job, out of time, queues itself again.")] = 0,
-    closing_s: Annotated[float, typer.Option(min=0, help="End so long before the job's time does.")] = 60.0,
+    resubmit: Annotated[
+        int, typer.Option(min=0, max=MOST_RETRIES, help="Times that the job, out of time, queues itself again.")
+    ] = 0,
+    closing_s: Annotated[
+        float, typer.Option(min=0, max=MOST_S, callback=finite, help="End so long before the job's time does.")
+    ] = 60.0,
     setup: Setup = None,
     dry_run: DryRun = False,
     parsable: Parsable = False,

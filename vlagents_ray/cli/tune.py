@@ -11,7 +11,7 @@ import typer
 import yaml
 
 from vlagents_ray.cli.console import errors, out, progress, table
-from vlagents_ray.cli.options import YAML_SUFFIXES, StateDims, parse_dims, parse_list
+from vlagents_ray.cli.options import YAML_SUFFIXES, StateDims, finite, parse_dims, parse_list
 from vlagents_ray.errors import ConfigError
 
 if TYPE_CHECKING:
@@ -30,15 +30,22 @@ def tune_command(
     wanted: Annotated[
         Wanted, typer.Option("--for", help="The most actions a second, or the most robots within --p99-ms.")
     ] = Wanted.throughput,
-    p99_ms: Annotated[float | None, typer.Option("--p99-ms", min=0, help="Of robots: the longest p99, ms.")] = None,
-    minutes: Annotated[float, typer.Option(min=0.1, help="That all of it may take.")] = 5.0,
-    max_batch: Annotated[int, typer.Option(min=1, help="The largest batch to try.")] = 32,
-    seconds: Annotated[float, typer.Option(min=0.1, help="Of each measurement.")] = 2.0,
+    p99_ms: Annotated[
+        float | None,
+        typer.Option("--p99-ms", min=0, max=1e6, callback=finite, help="Of robots: the longest p99, ms."),
+    ] = None,
+    minutes: Annotated[
+        float, typer.Option(min=0.1, max=10_000, callback=finite, help="That all of it may take.")
+    ] = 5.0,
+    max_batch: Annotated[int, typer.Option(min=1, max=10_000, help="The largest batch to try.")] = 32,
+    seconds: Annotated[float, typer.Option(min=0.1, max=3600, callback=finite, help="Of each measurement.")] = 2.0,
     dtypes: Annotated[str | None, typer.Option(help="To try, as bfloat16,int8; default: the accelerator's.")] = None,
-    tolerance: Annotated[float, typer.Option(min=0, help="Largest error of actions, share of their range.")] = 0.01,
+    tolerance: Annotated[
+        float, typer.Option(min=0, max=1, callback=finite, help="Largest error of actions, share of their range.")
+    ] = 0.01,
     frames: Annotated[Path | None, typer.Option(help="Recorded trajectories; default: random observations.")] = None,
     app: Annotated[str | None, typer.Option(help="Of the file, if it holds several.")] = None,
-    image: Annotated[int, typer.Option(min=1, help="Pixels a side, where the policy takes any image.")] = 224,
+    image: Annotated[int, typer.Option(min=1, max=8192, help="Pixels a side, where the policy takes any image.")] = 224,
     state: StateDims = [],  # noqa: B006
 ) -> None:
     """Find the best batch size, compilation and precision by measuring, and print the settings to change."""

@@ -13,8 +13,9 @@ from typing import Any
 import numpy as np
 
 from vlagents_ray.errors import ConfigError
-from vlagents_ray.naming import did_you_mean
+from vlagents_ray.naming import did_you_mean, without_doubles
 from vlagents_ray.registry import require
+from vlagents_ray.yaml_text import load_yaml
 
 Numbers = float | tuple[float, ...]  # one for all numbers of an action, or one for each
 QUANTILE = 0.999  # of the demonstrations' speeds: a single broken frame must not set a limit
@@ -73,7 +74,7 @@ class Limits:
             if urdf is None:
                 return limits
             return limits.stricter(cls._of_urdf(path.parent / urdf, limits.joints, tip, scale))
-        except (OSError, ValueError, KeyError, TypeError, AttributeError, ET.ParseError) as error:
+        except (OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError, ET.ParseError) as error:
             raise ConfigError(
                 f"limits {path}: {type(error).__name__}: {error}; want a .yaml or .json file of limits, a .urdf, or a "
                 f"LeRobotDataset v3.0; see docs/control_loop.md"
@@ -220,9 +221,5 @@ def _tuple(value: Any, unlimited: float) -> Any:
 def _document(path: Path) -> Any:
     text = path.read_text(encoding="utf-8")
     if path.suffix == ".json":
-        return json.loads(text)
-    yaml = require("yaml", extra="limits")
-    try:
-        return yaml.safe_load(text)
-    except yaml.YAMLError as error:
-        raise ValueError(str(error)) from error
+        return json.loads(text, object_pairs_hook=without_doubles)
+    return load_yaml(text, extra="limits")

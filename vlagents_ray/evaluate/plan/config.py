@@ -14,21 +14,37 @@ from pydantic import (
     Field,
     FiniteFloat,
     JsonValue,
-    NonNegativeFloat,
-    NonNegativeInt,
-    PositiveFloat,
-    PositiveInt,
     field_validator,
     model_validator,
 )
 from typing_extensions import Self
 
+from vlagents_ray.bounds import (
+    MOST_CPUS,
+    MOST_EPISODES,
+    MOST_RETRIES,
+    MOST_ROWS,
+    MOST_S,
+    MOST_SEED,
+    MOST_STEP,
+    MOST_STEPS_NAMED,
+    MOST_WORKERS,
+)
 from vlagents_ray.client.transports.select import TransportName
 from vlagents_ray.ray_tools.runtime_env import require_no_secrets
 
 EpisodeChoice = Literal["none", "failures", "all"]
 Tracker = Literal["wandb", "trackio", "tensorboard"]
 Name = Annotated[str, Field(min_length=1)]
+Count = Annotated[int, Field(ge=1, le=MOST_EPISODES)]
+Retries = Annotated[int, Field(ge=0, le=MOST_RETRIES)]
+Rows = Annotated[int, Field(ge=1, le=MOST_ROWS)]
+Seed = Annotated[int, Field(ge=0, le=MOST_SEED)]
+Step = Annotated[int, Field(ge=0, le=MOST_STEP)]  # of training; also a version of weights
+Workers = Annotated[int, Field(ge=0, le=MOST_WORKERS)]
+Resources = Annotated[float, Field(ge=0, le=MOST_CPUS)]  # CPUs or GPUs
+Seconds = Annotated[float, Field(gt=0, le=MOST_S)]
+Hertz = Annotated[float, Field(gt=0, le=10_000)]
 
 
 class _PlanModel(BaseModel):
@@ -38,15 +54,15 @@ class _PlanModel(BaseModel):
 class StepRange(_PlanModel):
     """Training steps at equal distances, the last one included."""
 
-    first: NonNegativeInt
-    last: NonNegativeInt
-    every: PositiveInt
+    first: Step
+    last: Step
+    every: Annotated[int, Field(ge=1, le=MOST_STEP)]
 
 
 class PushedWeights(_PlanModel):
     """Weights that a learner pushed, as `act.info["policy"]` names them."""
 
-    version: NonNegativeInt
+    version: Step
     fingerprint: str
 
 
@@ -61,10 +77,10 @@ class PolicyConfig(_PlanModel):
     options: dict[str, JsonValue] = {}  # passed to every `reset` of the policy
     checkpoint: str | None = None  # that the server loads; each episode's result names its own
     # A sweep over checkpoints: a list, or {first, last, every}; each is chosen by the reset option `checkpoint_step`.
-    steps: list[NonNegativeInt] = []
+    steps: list[Step] = Field(default=[], max_length=MOST_STEPS_NAMED)
     # The policy's present weights; their version replaces the checkpoint. Episodes of other weights are refused.
     pushed_weights: PushedWeights | None = None
-    execute: PositiveInt | None = None  # rows executed of each action chunk; None = all
+    execute: Rows | None = None  # rows executed of each action chunk; None = all
     # The codec of images over a network. JPEG changes them a little, so it must be set explicitly; the others do not,
     # and "exact" takes the faster of raw and lossless, so that results never depend on the link.
     codec: Literal["exact", "raw", "lossless", "jpeg"] = "exact"
@@ -76,7 +92,10 @@ class PolicyConfig(_PlanModel):
         if not isinstance(steps, dict):
             return steps
         given = StepRange.model_validate(steps)
-        return list(range(given.first, given.last + 1, given.every))
+        steps_named = range(given.first, given.last + 1, given.every)
+        if len(steps_named) > MOST_STEPS_NAMED:
+            raise ValueError(f"expected at most {MOST_STEPS_NAMED} steps, got {len(steps_named)}; raise `every`")
+        return list(steps_named)
 
     @field_validator("steps")
     @classmethod
@@ -98,9 +117,9 @@ class PolicyConfig(_PlanModel):
 class WorkerConfig(_PlanModel):
     """The resources of a worker, and its runtime environment."""
 
-    cpus: NonNegativeFloat = 0.5  # low, so that workers and policy fit on a small machine
-    gpus: NonNegativeFloat = 0.0
-    threads: PositiveInt = 1  # of OpenMP, MKL, llvmpipe and the like
+    cpus: Resources = 0.5  # low, so that workers and policy fit on a small machine
+    gpus: Resources = 0.0
+    threads: Annotated[int, Field(ge=1, le=MOST_CPUS)] = 1  # of OpenMP, MKL, llvmpipe and the like
     # Ray's; its env_vars override the thread settings. A simulator with other packages names their Python, with Ray in
     # it: {"py_executable": "/envs/rcs/bin/python"}.
     runtime_env: dict[str, JsonValue] = {}
@@ -116,12 +135,12 @@ class ClockConfig(_PlanModel):
     """Real-time mode: the env's clock runs while the policy computes (see `vlagents_ray.evaluate.episode.latency`)."""
 
     # s that each answer takes: "measured" as it comes, transport included, or injected, which repeats exactly.
-    latency: Literal["measured"] | Annotated[FiniteFloat, Field(ge=0)] = "measured"
+    latency: Literal["measured"] | Annotated[float, Field(ge=0, le=3600)] = "measured"
     # The action between observation and answer. "chunk": the rest of the last chunk, then a stop of the robot: "zero"
     # for relative actions, else "hold"; "hold": the last action again; "zero": no motion, the gripper as it was
     # commanded.
     meanwhile: Literal["chunk", "hold", "zero"] = "chunk"
-    hz: Annotated[FiniteFloat, Field(gt=0)] | None = None  # ticks per second; None: the env's control_hz
+    hz: Hertz | None = None  # ticks per second; None: the env's control_hz
     align: bool = True  # drop the rows for ticks at which others were executed before the answer
     # Send the policy the rest of the last chunk, and its number of ticks (`interface.DELAY`).
     real_time_chunking: bool = False
@@ -135,7 +154,7 @@ class StopConfig(_PlanModel):
     error_rate: float = Field(default=0.05, gt=0, lt=1)  # of each cell's confidence sequence, over all looks together
     target: float | None = Field(default=None, ge=0, le=1)  # stop when this success rate is excluded
     width: float | None = Field(default=None, gt=0, lt=1)  # stop when the interval is narrower
-    at_least: PositiveInt = 1  # episodes
+    at_least: Count = 1  # episodes
 
     @model_validator(mode="after")
     def _some_end(self) -> Self:
@@ -151,9 +170,9 @@ class SuiteConfig(_PlanModel):
     envs: list[Name] = Field(min_length=1)  # registered names, "maniskill/PushCube-v1", or patterns, "libero/*"
     env_options: dict[str, JsonValue] = {}  # passed to the constructor
     reset_options: dict[str, JsonValue] = {}  # passed to every `reset` of the env
-    episodes: PositiveInt = 10  # of each env and seed
-    seeds: list[NonNegativeInt] = Field(default=[0], min_length=1)  # episode i uses seed + i
-    num_envs: PositiveInt = 1  # that one worker steps together, in one simulator if it can (ManiSkill on a GPU)
+    episodes: Count = 10  # of each env and seed
+    seeds: list[Seed] = Field(default=[0], min_length=1)  # episode i uses seed + i
+    num_envs: Rows = 1  # that one worker steps together, in one simulator if it can (ManiSkill on a GPU)
     worker: WorkerConfig | None = None  # None: `EvalConfig.worker`
     clock: ClockConfig | None = None  # real-time mode; None: the env waits for the policy
 
@@ -185,7 +204,7 @@ class TrackingConfig(_PlanModel):
 
     project: Name = "vlagents-ray"
     group: str | None = None  # of runs; default: the name of the folder of results
-    videos: NonNegativeInt = 4  # of each cell that are uploaded, failures first
+    videos: Annotated[int, Field(ge=0, le=MOST_EPISODES)] = 4  # of each cell that are uploaded, failures first
 
 
 class RobotTask(_PlanModel):
@@ -193,8 +212,9 @@ class RobotTask(_PlanModel):
 
     instruction: Name  # to the policy, and to the operator
     setup: str = ""  # instructions for setting the scene
-    max_steps: PositiveInt = 600  # control ticks after which a trial ends
-    rubric: dict[Name, PositiveFloat] = {}  # the points of each part of the task, for a partial success
+    max_steps: Count = 600  # control ticks after which a trial ends
+    # The points of each part of the task, for a partial success.
+    rubric: dict[Name, Annotated[float, Field(gt=0, le=1e6)]] = {}
 
 
 class RobotConfig(_PlanModel):
@@ -204,16 +224,16 @@ class RobotConfig(_PlanModel):
     tasks: dict[Name, RobotTask] = Field(min_length=1)
     # Draws the order of policies; None: a key is drawn, and kept in the folder of results.
     key: Annotated[str, Field(min_length=8)] | None = None
-    hz: PositiveFloat = 10.0  # control rate
+    hz: Hertz = 10.0  # control rate
     # As in `ChunkPlayer` and `Guard`:
     mode: Literal["open_loop", "ensemble", "async"] = "async"
-    deadline_s: NonNegativeFloat | None = None  # None: 0 in "async", else 1
-    max_age_s: PositiveFloat | None = None
+    deadline_s: Annotated[float, Field(ge=0, le=3600)] | None = None  # None: 0 in "async", else 1
+    max_age_s: Seconds | None = None
     safe: Literal["auto", "hold", "zero"] = "auto"
-    max_step: PositiveFloat | None = None
+    max_step: Annotated[float, Field(gt=0, le=1e6)] | None = None
     measure: str | None = None  # the part of the state that is the measured pose
     limits: str | None = None  # a file of `Limits.read`, without the soft start
-    silent_s: PositiveFloat = 2.0  # a server that is silent for longer ends the trial, which is repeated
+    silent_s: Seconds = 2.0  # a server that is silent for longer ends the trial, which is repeated
 
 
 class EvalConfig(_PlanModel):
@@ -224,7 +244,7 @@ class EvalConfig(_PlanModel):
     out: Path
     # Environments rolled out in parallel, each in a Ray actor. 0: one after another in this process, without Ray.
     # None: 0 for a short evaluation, else 1 (see `chosen_workers`).
-    workers: NonNegativeInt | None = None
+    workers: Workers | None = None
     video: EpisodeChoice = "failures"  # of which episodes there are videos
     record: EpisodeChoice = "none"  # of which there are trajectories: numbers and the policy's images
     resume: bool = False
@@ -236,13 +256,14 @@ class EvalConfig(_PlanModel):
     robot: RobotConfig | None = None  # a real robot and its tasks
 
     # What happens when something breaks.
-    retries: NonNegativeInt = 3  # further attempts after an infrastructure failure
-    abort_after: NonNegativeInt = 10  # stop after so many lost episodes, or errors of policies, in a row; 0 = never
-    make_timeout_s: PositiveFloat = 300.0  # making an env, imports and shaders included
-    env_timeout_s: PositiveFloat = 60.0  # one reset or step
-    policy_timeout_s: PositiveFloat = 60.0  # one reset or act of the policy
-    connect_timeout_s: PositiveFloat = 120.0  # reaching the policy, a restart of its server included
-    place_timeout_s: PositiveFloat = 120.0  # until the cluster has resources for a worker
+    retries: Retries = 3  # further attempts after an infrastructure failure
+    # Stop after so many lost episodes, or errors of policies, in a row; 0 = never.
+    abort_after: Annotated[int, Field(ge=0, le=MOST_EPISODES)] = 10
+    make_timeout_s: Seconds = 300.0  # making an env, imports and shaders included
+    env_timeout_s: Seconds = 60.0  # one reset or step
+    policy_timeout_s: Seconds = 60.0  # one reset or act of the policy
+    connect_timeout_s: Seconds = 120.0  # reaching the policy, a restart of its server included
+    place_timeout_s: Seconds = 120.0  # until the cluster has resources for a worker
 
     @field_validator("policies")
     @classmethod

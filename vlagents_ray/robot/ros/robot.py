@@ -18,12 +18,12 @@ from vlagents_ray.chunking.buffer import SKEW_S, CaptureClock
 from vlagents_ray.contract import ActionSpec, CameraSpec, Contract, StateSpec
 from vlagents_ray.errors import ConfigError, InvalidAction, VLAgentsError
 from vlagents_ray.interface import CAPTURED, Obs
-from vlagents_ray.registry import require
 from vlagents_ray.robot.ros import messages
 from vlagents_ray.robot.ros.links import Link, Ros2, Rosbridge
 from vlagents_ray.robot.ros.messages import TWIST, PoseRotation, Values
 from vlagents_ray.robot.safety import Watchdog
 from vlagents_ray.settings import require_arguments
+from vlagents_ray.yaml_text import load_yaml
 
 logger = logging.getLogger(__name__)
 ROS2 = "ros2"
@@ -111,10 +111,9 @@ def read_settings(file: Path | str) -> RosSettings:
         ConfigError: The file cannot be read, or a setting is unknown, missing or wrong.
         MissingDependency: PyYAML is not installed.
     """
-    yaml = require("yaml", extra="ros")
     try:
-        stated = yaml.safe_load(Path(file).read_text())
-    except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
+        stated = load_yaml(Path(file).read_text(encoding="utf-8"), extra="ros")
+    except (OSError, ValueError) as error:
         raise ConfigError(f"{file}: cannot be read as a file of ROS topics ({error})") from error
     return settings_from(stated, str(file))
 

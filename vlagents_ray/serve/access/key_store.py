@@ -16,12 +16,14 @@ import os
 import re
 import secrets
 import tempfile
+import time
 from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
 from typing import Any
 
 from vlagents_ray.errors import ConfigError, shown
+from vlagents_ray.naming import without_doubles
 from vlagents_ray.protocol.messages import RANKS, RankName
 
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,63}")
@@ -69,10 +71,12 @@ class Key:
 def parse_keys(text: str) -> list[Key]:
     """Return the keys in the text of a key file; raise `ConfigError` if it is invalid or two keys share a name."""
     try:
-        document = json.loads(text)
+        document = json.loads(text, object_pairs_hook=without_doubles)
         entries = document["keys"]
     except (ValueError, TypeError, KeyError, RecursionError) as error:
-        raise ConfigError('keys: want a JSON document {"keys": [...]}; `vlagents-ray keys new` writes one') from error
+        raise ConfigError(
+            f'keys: expected a JSON document {{"keys": [...]}}, as `vlagents-ray keys new` writes it ({error})'
+        ) from error
     if not isinstance(entries, list):
         raise ConfigError(f"keys: got {type(entries).__name__}, want a list")
     keys = [_parse(entry) for entry in entries]
@@ -126,8 +130,12 @@ def new_key(file: Path, name: str, **allowed: Any) -> str:
         allowed: The other fields of `Key`.
 
     Raises:
-        ConfigError: The name is in use, a field is invalid, or the file cannot be changed.
+        ConfigError: The name is in use, a field is invalid, the key would have expired already, or the file cannot be
+            changed.
     """
+    expires = allowed.get("expires")
+    if expires is not None and expires <= time.time():
+        raise ConfigError(f"key {name!r}: expires: expected a time in the future, got {expires:.0f} s since 1970")
     token = _PREFIX + secrets.token_urlsafe(32)
     key = Key(name, hashlib.sha256(token.encode()).hexdigest(), **allowed)
 

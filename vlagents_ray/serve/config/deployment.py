@@ -9,6 +9,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, field_validator, model_validator
 
+from vlagents_ray.bounds import MOST_BYTES, MOST_CPUS, MOST_ROWS, MOST_S, MOST_WORKERS
 from vlagents_ray.interface import Agent
 from vlagents_ray.policies.adapters import ADAPTER
 from vlagents_ray.policies.base.program import Program, loaded_code
@@ -23,6 +24,7 @@ from vlagents_ray.serve.queue.call_limits import CallLimits
 
 POLICY, GATEWAY = "Policy", "Gateway"  # the deployments of an application
 
+Port = Annotated[int, Field(ge=1, le=65_535)]
 # Links are not followed: the interpreter of a virtual environment links to that of its creator.
 AbsolutePath = Annotated[str, AfterValidator(lambda path: os.path.abspath(os.path.expanduser(path)))]
 
@@ -39,9 +41,14 @@ class LiveArgs(_DeploymentModel):
     )
     ring_s: float = Field(default=30.0, gt=0, le=600, description="how much of each session is held, s")
     memory_mb: float = Field(
-        default=256.0, gt=0, description="memory that all sessions of a replica take at most, MB; the oldest goes first"
+        default=256.0,
+        gt=0,
+        le=1_000_000,
+        description="memory that all sessions of a replica take at most, MB; the oldest goes first",
     )
-    most_gb: float = Field(default=50.0, gt=0, description="size of the folder at which nothing more is saved, GB")
+    most_gb: float = Field(
+        default=50.0, gt=0, le=1_000_000, description="size of the folder at which nothing more is saved, GB"
+    )
 
 
 class EnvironmentArgs(_DeploymentModel):
@@ -76,8 +83,8 @@ class EnvironmentArgs(_DeploymentModel):
 class BatchArgs(_DeploymentModel):
     """The settings of the batch queue of one replica."""
 
-    max_size: int = Field(default=16, ge=1, description="observations in one forward pass, at most")
-    sizes: list[int] | None = Field(
+    max_size: int = Field(default=16, ge=1, le=MOST_ROWS, description="observations in one forward pass, at most")
+    sizes: list[Annotated[int, Field(le=MOST_ROWS)]] | None = Field(
         default=None,
         description="for compiled models: the only batch sizes to run, ascending; smaller batches are padded up to "
         "the next one. The largest is max_size, which may then be left out",
@@ -112,7 +119,9 @@ class CheckpointArgs(_DeploymentModel):
         "or hub id (org/name, org/name@COMMIT) of a LoRA adapter over the checkpoint in `config`",
     )
     steps: bool = Field(default=False, description="any step of a checkpoint whose path holds {step}")
-    loaded: int = Field(default=2, ge=1, description="checkpoints in the memory of one replica at once, at most")
+    loaded: int = Field(
+        default=2, ge=1, le=1_000_000, description="checkpoints in the memory of one replica at once, at most"
+    )
 
     @field_validator("choices")
     @classmethod
@@ -133,8 +142,10 @@ class CheckpointArgs(_DeploymentModel):
 class SessionArgs(_DeploymentModel):
     """The limits of the sessions of one replica."""
 
-    limit: int = Field(default=1000, ge=1, description="sessions held at once; the next reset gets 503")
-    idle_s: float = Field(default=600.0, gt=0, description="a session that sends nothing for so long is forgotten")
+    limit: int = Field(default=1000, ge=1, le=1_000_000, description="sessions held at once; the next reset gets 503")
+    idle_s: float = Field(
+        default=600.0, gt=0, le=MOST_S, description="a session that sends nothing for so long is forgotten"
+    )
 
 
 class StreamArgs(_DeploymentModel):
@@ -144,13 +155,13 @@ class StreamArgs(_DeploymentModel):
     """
 
     enabled: bool = True
-    ports: tuple[int, int] | None = Field(
+    ports: tuple[Port, Port] | None = Field(
         default=None, description="first and last port to choose from; unset: any. Each replica of a node takes one"
     )
 
     @model_validator(mode="after")
     def _ascending(self) -> StreamArgs:
-        if self.ports is not None and not 1 <= self.ports[0] <= self.ports[1] <= 65_535:
+        if self.ports is not None and self.ports[0] > self.ports[1]:
             raise ValueError(f"ports: got {list(self.ports)}, want the first and the last one, such as [9000, 9015]")
         return self
 
@@ -167,8 +178,12 @@ class RecordArgs(_DeploymentModel):
         description="exact: each pixel as the policy got it, in lossless H.264; small: as videos for training, some "
         "twenty times smaller, on which the same policy acts a little differently",
     )
-    fps: float = Field(default=10.0, gt=0, description="rate of the frames, one for each act, that the videos assume")
-    most_gb: float = Field(default=50.0, gt=0, description="size of the folder at which the recording ends, GB")
+    fps: float = Field(
+        default=10.0, gt=0, le=10_000, description="rate of the frames, one for each act, that the videos assume"
+    )
+    most_gb: float = Field(
+        default=50.0, gt=0, le=1_000_000, description="size of the folder at which the recording ends, GB"
+    )
 
 
 class LimitArgs(_DeploymentModel):
@@ -177,22 +192,27 @@ class LimitArgs(_DeploymentModel):
     slow_s: float = Field(
         default=30.0,
         gt=0,
+        le=MOST_S,
         description="a request's body has to be here, a WebSocket's reply to be taken in this time; else its "
         "connection is cut",
     )
     act_s: float = Field(
         default=CallLimits().act_s,
         gt=0,
+        le=MOST_S,
         description="a batch of acts, or a reset, that takes longer, and longer than ten times the longest so far, "
         "makes the replica unhealthy: Serve replaces it, and sessions go on elsewhere",
     )
     warm_up_s: float = Field(
         default=CallLimits().warm_up_s,
         gt=0,
+        le=MOST_S,
         description="the same for the first two resets and batches, of each of `batch.sizes`, which may compile",
     )
-    load_s: float = Field(default=CallLimits().load_s, gt=0, description="that loading a checkpoint may take")
-    body_bytes: int = Field(default=DEFAULT_LIMITS.body_bytes, ge=1024)
+    load_s: float = Field(
+        default=CallLimits().load_s, gt=0, le=MOST_S, description="that loading a checkpoint may take"
+    )
+    body_bytes: int = Field(default=DEFAULT_LIMITS.body_bytes, ge=1024, le=MOST_BYTES)
     reply_bytes: int = Field(
         default=DEFAULT_LIMITS.reply_bytes,
         ge=1024,
@@ -202,23 +222,25 @@ class LimitArgs(_DeploymentModel):
     decoded_bytes: int = Field(
         default=DEFAULT_LIMITS.decoded_bytes,
         ge=1024,
+        le=MOST_BYTES,
         description="of the images and bytes of one request, decoded, each as often as it is named; with the rate of a "
         "key it bounds what that has decoded in a second",
     )
     in_flight_bytes: int = Field(
         default=DEFAULT_LIMITS.in_flight_bytes,
         ge=1024,
+        le=MOST_BYTES,
         description="of all messages that a replica works on, encoded and decoded; over it the next ones get 503. A "
         "quarter is kept for robots",
     )
-    pixels: int = Field(default=DEFAULT_LIMITS.pixels, ge=1, description="of one image")
-    cameras: int = Field(default=DEFAULT_LIMITS.cameras, ge=0)
+    pixels: int = Field(default=DEFAULT_LIMITS.pixels, ge=1, le=MOST_BYTES, description="of one image")
+    cameras: int = Field(default=DEFAULT_LIMITS.cameras, ge=0, le=1_000_000)
     state_values: int = Field(
-        default=DEFAULT_LIMITS.state_values, ge=0, description="of one part of the proprioception"
+        default=DEFAULT_LIMITS.state_values, ge=0, le=1_000_000, description="of one part of the proprioception"
     )
-    depth: int = Field(default=DEFAULT_LIMITS.depth, ge=1, description="nesting of info and kwargs")
-    items: int = Field(default=DEFAULT_LIMITS.items, ge=1, description="values in info and kwargs")
-    text: int = Field(default=DEFAULT_LIMITS.text, ge=1, description="characters of an instruction")
+    depth: int = Field(default=DEFAULT_LIMITS.depth, ge=1, le=1_000_000, description="nesting of info and kwargs")
+    items: int = Field(default=DEFAULT_LIMITS.items, ge=1, le=1_000_000, description="values in info and kwargs")
+    text: int = Field(default=DEFAULT_LIMITS.text, ge=1, le=1_000_000, description="characters of an instruction")
 
     def limits(self) -> Limits:
         """Return the limits of the decoders."""
@@ -265,19 +287,24 @@ class AccessArgs(_DeploymentModel):
 class AutoscalingArgs(_DeploymentModel):
     """The number of replicas by measured load over all transports, see `vlagents_ray.serve.scaling.autoscaling`."""
 
-    min_replicas: int = Field(default=1, ge=0)
-    max_replicas: int = Field(default=1, ge=1)
-    initial_replicas: int | None = Field(default=None, ge=0)
+    min_replicas: int = Field(default=1, ge=0, le=MOST_WORKERS)
+    max_replicas: int = Field(default=1, ge=1, le=MOST_WORKERS)
+    initial_replicas: int | None = Field(default=None, ge=0, le=MOST_WORKERS)
     target_utilisation: float = Field(
         default=0.7, gt=0, le=1, description="share of the time in which a replica's policy is busy"
     )
     target_waiting: float = Field(
-        default=1.0, gt=0, description="mean number of requests in a replica's queue, in batches of the largest size"
+        default=1.0,
+        gt=0,
+        le=1_000_000,
+        description="mean number of requests in a replica's queue, in batches of the largest size",
     )
-    target_sessions: float | None = Field(default=None, gt=0, description="sessions of a replica; unset: any number")
-    look_back_s: float = Field(default=15.0, gt=0, description="load is averaged over this time")
-    upscale_delay_s: float = Field(default=10.0, ge=0, description="more must be wanted for this long")
-    downscale_delay_s: float = Field(default=300.0, ge=0, description="less must be wanted for this long")
+    target_sessions: float | None = Field(
+        default=None, gt=0, le=1_000_000, description="sessions of a replica; unset: any number"
+    )
+    look_back_s: float = Field(default=15.0, gt=0, le=MOST_S, description="load is averaged over this time")
+    upscale_delay_s: float = Field(default=10.0, ge=0, le=MOST_S, description="more must be wanted for this long")
+    downscale_delay_s: float = Field(default=300.0, ge=0, le=MOST_S, description="less must be wanted for this long")
 
     @model_validator(mode="after")
     def _ordered(self) -> AutoscalingArgs:
@@ -303,10 +330,14 @@ class AutoscalingArgs(_DeploymentModel):
 class ResourceArgs(_DeploymentModel):
     """The resources that Ray reserves for each replica."""
 
-    num_cpus: float = Field(default=0.0, ge=0, description="0 never competes with the rollouts for a slot")
-    num_gpus: float = Field(default=0.0, ge=0)
-    memory: float | None = Field(default=None, gt=0, description="bytes")
-    custom: dict[str, float] = Field(default_factory=dict, description="the cluster's own resources, by name")
+    num_cpus: float = Field(
+        default=0.0, ge=0, le=MOST_CPUS, description="0 never competes with the rollouts for a slot"
+    )
+    num_gpus: float = Field(default=0.0, ge=0, le=MOST_CPUS)
+    memory: float | None = Field(default=None, gt=0, le=MOST_BYTES, description="bytes")
+    custom: dict[str, Annotated[float, Field(ge=0, le=1e12)]] = Field(
+        default_factory=dict, description="the cluster's own resources, by name"
+    )
 
 
 class ServerArgs(_DeploymentModel):
@@ -320,7 +351,9 @@ class ServerArgs(_DeploymentModel):
         "{name: settings}",
     )
     checkpoints: CheckpointArgs = CheckpointArgs()
-    replicas: int | None = Field(default=None, ge=1, description="a fixed number; excludes `autoscaling`")
+    replicas: int | None = Field(
+        default=None, ge=1, le=MOST_WORKERS, description="a fixed number; excludes `autoscaling`"
+    )
     autoscaling: AutoscalingArgs | None = None
     batch: BatchArgs = BatchArgs()
     sessions: SessionArgs = SessionArgs()

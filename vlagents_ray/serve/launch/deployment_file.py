@@ -7,7 +7,6 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
-import yaml
 from pydantic import BaseModel, Field, ValidationError
 
 from vlagents_ray.contract import Contract
@@ -23,6 +22,7 @@ from vlagents_ray.serve.ports import LOOPBACK
 from vlagents_ray.serve.python_env.probe import check_policy, with_process
 from vlagents_ray.serve.requests import DEFAULT
 from vlagents_ray.settings import wrong_settings
+from vlagents_ray.yaml_text import read_yaml
 
 if TYPE_CHECKING:
     from ray.serve.schema import ServeDeploySchema
@@ -97,11 +97,7 @@ def read_deployment(
             raise ConfigError(f"deployment file {path.absolute()} does not exist{meant}")
         if overrides:
             raise ConfigError(f"{source!r} holds the settings; edit it instead of giving {sorted(overrides)}")
-        try:
-            document = yaml.safe_load(path.read_text())
-        except yaml.YAMLError as error:
-            raise ConfigError(f"{source}: not YAML ({error})") from error
-        return _checked(document, source, step_follows)
+        return _checked(read_yaml(path), source, step_follows)
     if ":" not in source and source not in names("policies"):
         if "/" in source:
             raise UnknownPolicy(

@@ -1,0 +1,66 @@
+"""The one reader of YAML: a key that is written twice is an error, and `1e-4` is a number."""
+
+from __future__ import annotations
+
+import functools
+import re
+from pathlib import Path
+from typing import Any
+
+from vlagents_ray.errors import ConfigError
+from vlagents_ray.registry import require
+
+# YAML 1.1 reads only `1.0e+12` as a number, and `1e12` as text; YAML 1.2 and JSON read both as numbers.
+_FLOAT = re.compile(r"[-+]?(\.[0-9]+|[0-9]+(\.[0-9]*)?)[eE][-+]?[0-9]+")
+
+
+def load_yaml(text: str, *, extra: str = "serve") -> Any:
+    """Return the document in a text.
+
+    Args:
+        text: YAML.
+        extra: The extra of this package to install if PyYAML is missing.
+
+    Raises:
+        ValueError: The text is not YAML, or has a key twice in one mapping.
+        MissingDependency: PyYAML is not installed.
+    """
+    yaml = require("yaml", extra=extra)
+    try:
+        return yaml.load(text, Loader=_loader(yaml))
+    except yaml.YAMLError as error:
+        raise ValueError(str(error)) from error
+    except RecursionError as error:
+        raise ValueError("it is nested too deeply") from error
+
+
+def read_yaml(file: Path | str, *, extra: str = "serve") -> Any:
+    """Return the document in a file; raise `ConfigError` if it cannot be read or `load_yaml` raises."""
+    try:
+        return load_yaml(Path(file).read_text(encoding="utf-8"), extra=extra)
+    except OSError as error:
+        raise ConfigError(f"{file}: cannot be read ({error.strerror})") from error
+    except ValueError as error:  # also of a file that is not UTF-8
+        raise ConfigError(f"{file}: not YAML ({error})") from error
+
+
+@functools.cache
+def _loader(yaml: Any) -> Any:
+    class Loader(yaml.SafeLoader):  # type: ignore[misc]
+        def construct_mapping(self, node: Any, deep: bool = False) -> Any:
+            first: dict[tuple[str, str], Any] = {}
+            for key, _ in node.value if isinstance(node, yaml.MappingNode) else ():
+                if not isinstance(key, yaml.ScalarNode) or key.tag == "tag:yaml.org,2002:merge":
+                    continue
+                earlier = first.setdefault((key.tag, key.value), key)
+                if earlier is not key:
+                    raise yaml.constructor.ConstructorError(
+                        f"the key {key.value!r} is written twice, first at",
+                        earlier.start_mark,
+                        "and again here; keep one of the two",
+                        key.start_mark,
+                    )
+            return super().construct_mapping(node, deep)
+
+    Loader.add_implicit_resolver("tag:yaml.org,2002:float", _FLOAT, list("-+.0123456789"))
+    return Loader
