@@ -1,7 +1,11 @@
 # What `ray start` and whatever talks to the cluster find in their environment: `. environment.sh` on every machine.
 
-# Nobody joins or commands the cluster without the token in ~/.ray/auth_token.
+# Only holders of the token in ~/.ray/auth_token join or command the cluster. Ray writes the file with the permissions of
+# the umask, and copies may lose theirs: no other account of this machine may read it.
 export RAY_AUTH_MODE=token
+if [ -e ~/.ray/auth_token ]; then
+  chmod go= ~/.ray/auth_token
+fi
 # HAProxy is Serve's ingress: a request goes from it straight to a replica, not through a Python proxy.
 export RAY_SERVE_ENABLE_HA_PROXY=1
 # An HTTP session stays on its replica by its header; whoever sends no headers is cut off after 5 s, and a WebSocket's

@@ -4,6 +4,9 @@ from __future__ import annotations
 
 import os
 import re
+import subprocess
+import sys
+import tempfile
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -200,3 +203,56 @@ def test_a_folder_whose_name_is_too_long_for_sockets_is_replaced(
         assert folder.parent == Path("/tmp")
         assert folder.stat().st_mode & 0o777 == 0o700
     assert not folder.exists()
+
+
+# Starts two clusters after each other, and lists what other accounts of the machine could read of their tokens.
+OPEN_HOME = """
+import os, stat, sys
+from pathlib import Path
+import ray
+from vlagents_ray.ray_tools.session import joined
+
+os.umask(0o022)
+
+def readable_by_others(path):
+    open_folders = all(stat.S_IMODE(folder.stat().st_mode) & 0o001 for folder in path.parents)
+    return open_folders and bool(stat.S_IMODE(path.stat().st_mode) & 0o004)
+
+tokens = []
+for _ in range(2):
+    with joined("local", num_cpus=1):
+        token = Path(os.environ["RAY_AUTH_TOKEN_PATH"]).read_text()
+        tokens.append(token)
+        assert ray.get(ray.remote(lambda: 3).remote()) == 3
+        files = [path for place in sys.argv[1:] for path in Path(place).rglob("*") if path.is_file()]
+        holders = [path for path in files if token.encode() in path.read_bytes()]
+        assert len(holders) == 1, holders
+        assert not any(map(readable_by_others, holders)), holders
+assert len(set(tokens)) == 2
+assert not (Path.home() / ".ray").exists()
+assert "RAY_AUTH_TOKEN_PATH" not in os.environ
+print("closed to others")
+"""
+
+
+@pytest.mark.ray
+def test_the_token_of_a_started_cluster_is_its_own_and_closed_to_other_accounts(tmp_path: Path) -> None:
+    """Whoever reads the token runs code as this user, and a home folder that others may enter is usual."""
+    with tempfile.TemporaryDirectory() as folder:  # short, for the names of Ray's sockets
+        Path(folder).chmod(0o755)
+        home, files = Path(folder, "home"), Path(folder, "t")
+        for place in (home, files):
+            place.mkdir(mode=0o755)
+        environment = {name: value for name, value in os.environ.items() if not name.startswith("RAY_AUTH")}
+        environment |= {"HOME": str(home), "TMPDIR": str(files), "RAY_TMPDIR": str(files)}
+        script = tmp_path / "open_home.py"
+        script.write_text(OPEN_HOME)
+        run = subprocess.run(
+            [sys.executable, script, home, files],
+            check=False,
+            env=environment,
+            capture_output=True,
+            text=True,
+            timeout=300,
+        )
+    assert run.stdout.endswith("closed to others\n"), run.stderr

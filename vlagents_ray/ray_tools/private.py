@@ -48,11 +48,15 @@ def use_loopback(on: bool) -> bool:
     return before
 
 
-def reread_authentication_mode() -> None:
-    """Make Ray read `RAY_AUTH_MODE` again, which it otherwise reads only when it is imported."""
+def reread_authentication() -> None:
+    """Make Ray read `RAY_AUTH_MODE` and the token again.
+
+    Ray reads the mode when it is imported, and the token when it is first needed.
+    """
     import ray
 
     ray._raylet.Config.initialize("")
+    ray._raylet.AuthenticationTokenLoader.instance().reset_cache()
 
 
 def address_of_ray_start() -> str | None:
@@ -70,7 +74,7 @@ def address_of_ray_start() -> str | None:
 
 
 def start_head(temp_dir: str, dashboard_port: int, **params: Any) -> Any:
-    """Start the daemons of a one-machine cluster that requires a token, and return Ray's record of them.
+    """Start the daemons of a one-machine cluster that requires the token of `RAY_AUTH_TOKEN_PATH`.
 
     `ray.init("local")` does the same, but always with an autoscaler and a log monitor, which one machine does not need
     (90 MB, 1 s), and with an agent at a fixed port, whose start takes 3 s longer while another Ray uses that port.
@@ -78,14 +82,18 @@ def start_head(temp_dir: str, dashboard_port: int, **params: Any) -> Any:
     Args:
         dashboard_port: The port of the dashboard, which is not served.
         params: Resources and further parameters of Ray's nodes: `num_cpus`, `num_gpus`, `resources`, ...
+
+    Returns:
+        Ray's record of the daemons.
     """
     from ray._common.usage import usage_lib
     from ray._private.authentication import authentication_token_setup
     from ray._private.node import Node
     from ray._private.parameter import RayParams
 
+    reread_authentication()
     authentication_token_setup.enable_token_auth_by_default()
-    authentication_token_setup.ensure_token_if_auth_enabled(create_token_if_missing=True)
+    authentication_token_setup.ensure_token_if_auth_enabled(create_token_if_missing=False)
     usage_lib.set_usage_stats_enabled_via_env_var(False)
     ray_params = RayParams(
         temp_dir=temp_dir,

@@ -6,6 +6,7 @@ import contextlib
 import json
 import logging
 import os
+import secrets
 import shutil
 import socket
 import tempfile
@@ -39,7 +40,9 @@ _LONGEST = 107 - len("/vlr-12345678/") - max(map(len, _SOCKETS))
 _REMOVALS = 100  # attempts, 0.05 s apart, as a process that is ending may still write to the folder
 _FILE = "server.json"  # written into the private folder of a server's Ray when the server is ready
 
-MODE, _TOKENS = "RAY_AUTH_MODE", ("RAY_AUTH_TOKEN", "RAY_AUTH_TOKEN_PATH")
+_TOKEN_FILE = "token"  # noqa: S105 - the token of the cluster, in its `ray_folder`
+
+MODE, _TOKEN, _TOKEN_PATH = "RAY_AUTH_MODE", "RAY_AUTH_TOKEN", "RAY_AUTH_TOKEN_PATH"
 # If this variable is "0", Ray assumes a single-node cluster and uses the loopback address as the node's, so that all
 # ports are bound there. (Ray replaces an address given as `_node_ip_address`.)
 ALONE = "RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER"
@@ -71,6 +74,7 @@ def joined(address: str | None = None, **options: Any) -> Iterator[None]:
         try:
             if address == "local":
                 folder = stack.enter_context(ray_folder())
+                stack.enter_context(variables(token_variables(folder)))
                 with variables({MARK: str(folder)}):
                     start_ray(folder, **options)
             # Without a cluster of `ray start`, Ray would try that of a server here, and wait for ten minutes.
@@ -113,19 +117,40 @@ def ray_folder() -> Iterator[Path]:
             time.sleep(0.05)
 
 
+def token_variables(folder: Path) -> dict[str, str | None]:
+    """Create the token of the cluster that is about to start, and return the variables that select it.
+
+    The token runs any code as this user. Ray itself would write one for all clusters of the user to ~/.ray/auth_token,
+    with the permissions of the umask, which usually let every account of the machine read it. A token that the user or
+    another cluster has set is replaced: only processes that `join` reach this cluster, and `join` finds its token.
+
+    Args:
+        folder: The `ray_folder` of the cluster, which no other user can enter.
+    """
+    path = folder / _TOKEN_FILE
+    descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600)
+    with os.fdopen(descriptor, "w") as file:
+        file.write(secrets.token_hex(32))
+    return {_TOKEN_PATH: str(path), _TOKEN: None}
+
+
 @contextlib.contextmanager
-def variables(values: Mapping[str, str]) -> Iterator[None]:
-    """Set environment variables for processes that are started within the context."""
+def variables(values: Mapping[str, str | None]) -> Iterator[None]:
+    """Set environment variables for processes that are started within the context; None unsets one."""
     before = {name: os.environ.get(name) for name in values}
-    os.environ.update(values)
+    _set_variables(values)
     try:
         yield
     finally:
-        for name, value in before.items():
-            if value is None:
-                os.environ.pop(name, None)
-            else:
-                os.environ[name] = value
+        _set_variables(before)
+
+
+def _set_variables(values: Mapping[str, str | None]) -> None:
+    for name, value in values.items():
+        if value is None:
+            os.environ.pop(name, None)
+        else:
+            os.environ[name] = value
 
 
 def start_ray(folder: Path, **options: Any) -> None:
@@ -180,6 +205,7 @@ def leave_ray() -> None:
     ray.shutdown()
     while _started:
         _started.pop().kill_all_processes(check_alive=False, wait=True)
+    private.reread_authentication()  # the next cluster has another token
 
 
 def started_here() -> bool:
@@ -281,14 +307,9 @@ def join(server: str | None = None, **options: Any) -> LocalServer:
         )
     if os.environ.get(MODE, "token").lower() != "token":
         raise ConfigError(f"{MODE}={os.environ[MODE]}: the Ray of {chosen.url} needs its token; unset {MODE}")
-    tokens = {one: environment[one] for one in _TOKENS if environment.get(one)}
-    if not tokens and environment.get("HOME"):  # Ray stores the token there; this process may have another home
-        tokens = {_TOKENS[1]: f"{environment['HOME']}/.ray/auth_token"}
-    for one in _TOKENS:
-        os.environ.pop(one, None)
-    os.environ.update({MODE: "token", ALONE: "0"} | tokens)
+    _set_variables({MODE: "token", ALONE: "0", _TOKEN: None, _TOKEN_PATH: environment[_TOKEN_PATH]})
     private.use_loopback(True)  # Ray has already read the variables, when it was imported
-    private.reread_authentication_mode()
+    private.reread_authentication()
     ray.init(chosen.ray_address, **{"log_to_driver": True, "logging_level": "WARNING"} | options)
     return chosen
 

@@ -335,7 +335,7 @@ def own_ray(
         # replaced. Otherwise the user's values are kept, unless they are in `ours`.
         inherited = MARK in os.environ
         new = {key: value for key, value in environment.items() if inherited or key not in os.environ}
-        stack.enter_context(session.variables(new | ours))
+        stack.enter_context(session.variables(new | ours | session.token_variables(folder)))
         stack.callback(private.use_loopback, private.use_loopback(True))  # `ALONE` was read when Ray was imported
         if listener is not None:
             listener.require()
