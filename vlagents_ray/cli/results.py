@@ -145,6 +145,12 @@ def verify_command(
     replay: Annotated[
         int, typer.Option(min=0, max=MOST_EPISODES, help="Episodes whose recorded actions are played again.")
     ] = 3,
+    seed: Annotated[
+        int | None,
+        typer.Option(
+            min=0, max=2**63 - 1, help="Draw those episodes by this seed; default: a new one, which is printed."
+        ),
+    ] = None,
     into: Annotated[Path | None, typer.Option("--out", help="Keep its results in this new folder.")] = None,
     trust: Annotated[bool, typer.Option("--trust", help="Also make environments that name code or files.")] = False,
     max_gb: Annotated[
@@ -160,7 +166,7 @@ def verify_command(
     from vlagents_ray.evaluate.bundle import verify
 
     with errors():
-        found = verify(bundle, into=into, replay=replay, trust=trust, most_bytes=int(max_gb * 1e9))
+        found = verify(bundle, into=into, replay=replay, seed=seed, trust=trust, most_bytes=int(max_gb * 1e9))
         if as_json:
             print_json({"holds": found.holds, **asdict(found)})
         else:
@@ -168,7 +174,8 @@ def verify_command(
             for one in found.findings:
                 rows.add_row(one.subject, one.verdict, one.detail)
             out.print(rows)
-            out.print(f"\nbundle sha256:{found.digest}: {'holds' if found.holds else 'is contradicted'}")
+            out.print(f"\nreplayed episodes were drawn by --seed {found.seed}")
+            out.print(f"bundle sha256:{found.digest}: {'holds' if found.holds else 'is contradicted'}")
             if into is not None:
                 out.print(f"results: {into}")
     raise typer.Exit(not found.holds)

@@ -12,7 +12,9 @@ import hashlib
 import json
 import math
 import os
+import random
 import re
+import secrets
 import shutil
 import sqlite3
 import stat
@@ -24,7 +26,7 @@ from contextlib import closing
 from dataclasses import dataclass
 from itertools import islice, zip_longest
 from pathlib import Path
-from typing import IO, Any, Literal
+from typing import IO, Any, Literal, get_args
 
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
@@ -32,9 +34,10 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from vlagents_ray.envs.base import make_batch
 from vlagents_ray.errors import ConfigError, VLAgentsError
 from vlagents_ray.evaluate.artifacts import storage
-from vlagents_ray.evaluate.artifacts.recorder import Trajectory
+from vlagents_ray.evaluate.artifacts.recorder import NO_VERSION, Trajectory
 from vlagents_ray.evaluate.episode.episode import options_of_reset
 from vlagents_ray.evaluate.episode.failures import EnvStep, env_side
+from vlagents_ray.evaluate.episode.records import Ending, Status
 from vlagents_ray.evaluate.episode.second_pass import play_actions
 from vlagents_ray.evaluate.plan.config import canonical, fingerprint
 from vlagents_ray.evaluate.report.page import FILE as REPORT
@@ -278,6 +281,7 @@ class Verification:
 
     digest: str  # SHA-256 of the bundle's manifest, which identifies its content
     findings: list[Finding]
+    seed: int  # by which the replayed episodes were drawn
 
     @property
     def holds(self) -> bool:
@@ -286,7 +290,13 @@ class Verification:
 
 
 def verify(
-    bundle: Path, *, into: Path | None = None, replay: int = 3, trust: bool = False, most_bytes: int = MOST_BYTES
+    bundle: Path,
+    *,
+    into: Path | None = None,
+    replay: int = 3,
+    seed: int | None = None,
+    trust: bool = False,
+    most_bytes: int = MOST_BYTES,
 ) -> Verification:
     """Check a bundle, which may come from a stranger.
 
@@ -298,6 +308,7 @@ def verify(
         into: A new folder for its results, which can be read, merged and exported as any others; None: they are
             removed. Summary and report in it are written from the database.
         replay: The number of episodes whose recorded actions are played again.
+        seed: The seed by which these episodes are drawn; None: a new one, which the author of the bundle cannot know.
         trust: Whether its environments may name any code and files.
         most_bytes: The most bytes that its files may have together.
 
@@ -310,6 +321,8 @@ def verify(
     """
     if into is not None and into.exists():
         raise ConfigError(f"{into}: is there already; want a new folder")
+    if seed is None:
+        seed = secrets.randbits(32)
     parent = None if into is None else into.absolute().parent
     with storage.storing(parent or Path(tempfile.gettempdir())):
         if parent is not None:
@@ -321,7 +334,7 @@ def verify(
             fine = f"{len(manifest.files)} files have the SHA-256 that {MANIFEST} states"
             findings = [_finding("digests", odd, fine)]
             try:
-                findings += _check(folder, replay, trust=trust)
+                findings += _check(folder, replay, seed, trust=trust)
             except (VLAgentsError, sqlite3.Error):
                 raise
             except (ArithmeticError, LookupError, RecursionError, TypeError, ValueError, AttributeError) as error:
@@ -331,10 +344,10 @@ def verify(
                 ) from error
             if into is not None:
                 os.replace(folder, into)
-    return Verification(digest, findings)
+    return Verification(digest, findings, seed)
 
 
-def _check(folder: Path, replay: int, *, trust: bool) -> Iterator[Finding]:
+def _check(folder: Path, replay: int, seed: int, *, trust: bool) -> Iterator[Finding]:
     """Yield all findings except that of the digests; also write summary and report."""
     if not (folder / DATABASE).is_file():
         raise ConfigError(f"got no {DATABASE} in the bundle; want one that `vlagents-ray bundle` wrote")
@@ -342,6 +355,7 @@ def _check(folder: Path, replay: int, *, trust: bool) -> Iterator[Finding]:
     if not results.runs or not results.cells:
         raise ConfigError(f"{DATABASE}: has no run, or no cell; want the results of an evaluation")
     yield _check_cells(results)
+    yield _check_episodes(results)
     write_summary(summarize(results))
     write_report(results, folder / REPORT)
     yield _check_trajectories(results)
@@ -349,30 +363,133 @@ def _check(folder: Path, replay: int, *, trust: bool) -> Iterator[Finding]:
     if not replay:
         yield Finding("replay", "not checked", "was not asked for (--replay 0)")
         return
-    # The first episode with a recording of each cell in turns, then the second of each, and so on.
-    by_cell = [[(cell, one) for one in cell.episodes if one.result.status == "done"] for cell in results.cells]
-    turns = (pair for turn in zip_longest(*by_cell) for pair in turn if pair is not None)
-    found = ((*pair, trajectory) for pair in turns if (trajectory := _recorded(results, pair[1])) is not None)
-    if not (chosen := list(islice(found, replay))):
+    drawn = ((*pair, _recorded(results, pair[1])) for pair in _drawn(results, seed))
+    chosen = list(islice((one for one in drawn if one[2] is not None), replay))
+    if not chosen:
         yield Finding("replay", "not checked", "no finished episode has a recording (eval --record all)")
     for cell, episode, trajectory in chosen:
-        yield _replay(cell, episode, trajectory, trust=trust)
+        if trajectory is not None:
+            yield _replay(cell, episode, trajectory, trust=trust)
+
+
+def _drawn(results: Results, seed: int) -> Iterator[tuple[CellResults, Episode]]:
+    """Yield the finished episodes in a random order: one of each cell in turns, so that each cell is checked."""
+    draw = random.Random(seed)
+    cells = [[(cell, one) for one in cell.episodes if one.result.status == "done"] for cell in results.cells]
+    draw.shuffle(cells)
+    for episodes in cells:
+        draw.shuffle(episodes)
+    for turn in zip_longest(*cells):
+        yield from (pair for pair in turn if pair is not None)
 
 
 def _check_cells(results: Results) -> Finding:
-    """Check that the cells and the keys of their episodes are those of their settings."""
+    """Check that cells and keys of episodes are those of their settings, and that nothing was mixed or left out."""
     odd = []
+    rules = {json.dumps(run.config.get("stop"), sort_keys=True) for run in results.runs}
     for cell in results.cells:
+        name = f"{cell.contender} in {cell.task}"
         named = cell.settings.get("env"), cell.settings.get("policy")
         if fingerprint(cell.settings) != cell.cell or named != (cell.env, cell.policy):
-            odd.append(f"{cell.contender} in {cell.task}: its settings are not those of its key")
-        found = [one.result.key for one in cell.episodes]
-        odd += [f"{key}: is of another cell or env" for key in found if key.env != cell.env]
+            odd.append(f"{name}: its settings are not those of its key")
+        rule = None if cell.stop is None else cell.stop.model_dump(mode="json")
+        if json.dumps(rule, sort_keys=True) not in rules:
+            odd.append(f"{name}: no run stopped early by its rule")
+        keys_of_cell = [one.result.key for one in cell.episodes]
+        odd += [f"{key}: is of another cell or env" for key in keys_of_cell if key.env != cell.env]
+        odd += [f"{name}: {text}" for text in _mixtures(results, cell)]
     stated = {str(one.result.key) for cell in results.cells for one in cell.episodes}
     with reading(results.out) as db:
         keys = {row["key"] for row in table(db, "episodes")}
     odd += [f"{key}: its key does not match its columns, or it has no cell" for key in sorted(keys - stated)]
     return _finding("database", odd, f"{len(results.cells)} cells and {len(keys)} episodes have their settings' keys")
+
+
+# Of all episodes of a cell. A run whose change was accepted may have added another one; checkpoints are never mixed.
+_ONE_OF_A_CELL = ("checkpoint", "weights", "env_program", "policy_program")
+
+
+def _mixtures(results: Results, cell: CellResults) -> Iterator[str]:
+    """Yield what the episodes of a cell do not have in common, although an evaluation would have refused to add it."""
+    for column in _ONE_OF_A_CELL:
+        if results.accepted_changes and column != "checkpoint":
+            continue
+        if column.endswith("_program"):
+            values = {getattr(one, column) for one in cell.episodes if one.counts}
+        else:  # unknown for an episode that failed in the policy's reset
+            values = {getattr(one.result, column) for one in cell.episodes} - {None}
+        if len(values) > 1:
+            yield f"its episodes have {len(values)} values of {column}, and no accepted change says so"
+    fingerprints: dict[int, set[str]] = {}
+    for one in cell.episodes:
+        if one.result.policy_version is not None and one.result.policy_fingerprint is not None:
+            fingerprints.setdefault(one.result.policy_version, set()).add(one.result.policy_fingerprint)
+    for version, several in fingerprints.items():
+        if len(several) > 1:
+            yield f"version {version} of the weights has {len(several)} fingerprints"
+    if any(one.unplanned for one in cell.episodes) and not any(
+        change.subject == "plan" for change in results.accepted_changes
+    ):
+        yield "it has episodes beyond its plan, in no rate, and no accepted change says that the plan became smaller"
+
+
+def _check_episodes(results: Results) -> Finding:
+    """Check that the columns of each episode do not contradict each other."""
+    odd: list[str] = []
+    runs = {run.run for run in results.runs}
+    recordings: dict[str, int] = {}
+    number = 0
+    for cell in results.cells:
+        for episode in cell.episodes:
+            number += 1
+            texts = list(_inconsistencies(cell, episode))
+            if episode.run not in runs:
+                texts.append(f"there is no run {episode.run}")
+            odd += [f"{episode.result.key}: {text}" for text in texts]
+            if episode.trajectory is not None:
+                recordings[episode.trajectory] = recordings.get(episode.trajectory, 0) + 1
+    odd += [f"{path}: is the recording of {times} episodes" for path, times in recordings.items() if times > 1]
+    there = (path.relative_to(results.out) for path in (results.out / storage.TRAJECTORIES).rglob("*.npz"))
+    odd += [f"{path}: is the recording of no episode" for path in sorted(map(str, there)) if path not in recordings]
+    return _finding("episodes", odd, f"{number} have outcomes without contradiction")
+
+
+def _inconsistencies(cell: CellResults, episode: Episode) -> Iterator[str]:
+    """Yield the contradictions between the columns of one episode."""
+    result = episode.result
+    outcome = (result.success_once, result.success_at_end, result.first_success)
+    if result.status not in get_args(Status) or result.ending not in get_args(Ending):
+        yield f"got the status {result.status!r} and the ending {result.ending!r}, which no evaluation writes"
+    if (result.status == "done") != (result.error is None) or (result.status == "done") != (result.ending != "error"):
+        yield f"its error or ending ({result.ending}) contradicts its status {result.status!r}"
+    if result.status == "infra_failed":
+        if outcome != (None, None, None) or result.steps or result.actions_sha256 is not None:
+            yield "it failed by infrastructure, but has an outcome"
+        if episode.trajectory is not None:
+            yield "it failed by infrastructure, but has a recording"
+        return
+    if result.status == "policy_error" and outcome != (False, False, None):
+        yield "an error of the policy ended it, but it was solved"
+    solved_after = result.first_success
+    if None in outcome[:2] or result.success_once != (solved_after is not None):
+        yield "success_once contradicts first_success"
+    elif solved_after is not None and not 1 <= solved_after <= result.steps:
+        yield f"it was solved after {solved_after} of {result.steps} steps"
+    elif (result.success_at_end and not result.success_once) or (
+        solved_after is not None and solved_after == result.steps and not result.success_at_end
+    ):
+        yield "success_at_end contradicts first_success"
+    pushed = cell.settings.get("pushed_weights")
+    acted = (result.first_policy_version, result.policy_version, result.policy_fingerprint)
+    if pushed and result.policy_version is not None:
+        expected = (pushed["version"], pushed["version"], pushed["fingerprint"])
+        if acted != expected:
+            yield f"versions {acted[0]} to {acted[1]} ({acted[2]}) acted, not {expected[0]} ({expected[2]})"
+    waited = (result.ticks_waited, result.ticks_held, result.latency_ms)
+    if cell.settings.get("clock") is None and waited != (0, 0, None):
+        yield "it waited for answers, but its environment stood still meanwhile"
+    if not 0 <= result.ticks_held <= result.ticks_waited <= result.steps:
+        yield f"{result.ticks_held} ticks without an action, {result.ticks_waited} waited, of {result.steps} steps"
 
 
 def _check_trajectories(results: Results) -> Finding:
@@ -381,16 +498,17 @@ def _check_trajectories(results: Results) -> Finding:
     checked, missing = 0, 0
     for cell in results.cells:
         for one in cell.episodes:
-            if one.result.status != "done":
+            if one.result.status == "infra_failed":
                 continue
             if (trajectory := _recorded(results, one)) is None:
                 missing += 1
                 continue
             checked += 1
-            odd += [f"{one.result.key}: {text}" for text in _contradictions(one, trajectory)]
+            synchronous = cell.settings.get("clock") is None
+            odd += [f"{one.result.key}: {text}" for text in _contradictions(one, trajectory, synchronous=synchronous)]
     if not checked and not odd:
         return Finding("trajectories", "not checked", f"the bundle has none of {missing} episodes (eval --record all)")
-    rest = f"; {missing} others have none" if missing else ""
+    rest = f"; {missing} others have none, so that their outcomes are only stated" if missing else ""
     return _finding("trajectories", odd, f"{checked} have the actions, rewards and outcomes of the table{rest}")
 
 
@@ -411,12 +529,9 @@ def _recorded(results: Results, episode: Episode) -> Trajectory | None:
         raise ConfigError(f"{episode.trajectory}: states a size that does not fit into memory") from error
 
 
-def _contradictions(episode: Episode, trajectory: Trajectory) -> Iterator[str]:
+def _contradictions(episode: Episode, trajectory: Trajectory, *, synchronous: bool) -> Iterator[str]:
     result, steps = episode.result, len(trajectory.actions)
-    shapes = [trajectory.rewards.shape == (steps,), trajectory.success.shape == (steps,)]
-    shapes += [len(values) == steps + 1 for values in trajectory.state.values()]
-    shapes += [] if trajectory.gripper is None else [trajectory.gripper.shape == (steps + 1,)]
-    if not all(shapes) or result.steps != steps:
+    if not _has_one_length(trajectory) or result.steps != steps:
         yield f"{result.steps} steps in the table, other lengths in the recording"
         return
     if hashlib.sha256(np.ascontiguousarray(trajectory.actions, "<f4").tobytes()).hexdigest() != result.actions_sha256:
@@ -424,8 +539,25 @@ def _contradictions(episode: Episode, trajectory: Trajectory) -> Iterator[str]:
     total = float(sum(trajectory.rewards.tolist()))
     if not math.isclose(total, result.episode_return, rel_tol=_TOLERANCE, abs_tol=1e-12):
         yield "the recorded rewards have another sum"
-    if _outcome(trajectory.success.astype(bool).tolist())[1:] != (result.success_at_end, result.first_success):
+    if result.status != "done":  # an error of the policy ended it: it counts as no success, whatever was recorded
+        return
+    outcome = (result.success_once, result.success_at_end, result.first_success)
+    if _outcome(trajectory.success.astype(bool).tolist()) != outcome:
         yield "the recorded success is not that of the table"
+    versions = [int(version) for version in trajectory.versions if version != NO_VERSION]
+    acted = (versions[0], versions[-1]) if versions else (None, None)
+    if synchronous and acted != (result.first_policy_version, result.policy_version):  # else an answer may be unused
+        yield "the recorded versions of the weights are not those of the table"
+
+
+def _has_one_length(trajectory: Trajectory) -> bool:
+    """Return whether each step has its action, reward, success and version, and each observation its numbers."""
+    steps = len(trajectory.actions)
+    of_steps = [values.shape for values in (trajectory.rewards, trajectory.success, trajectory.versions)]
+    of_observations = [len(values) for values in trajectory.state.values()]
+    if trajectory.gripper is not None:
+        of_observations.append(trajectory.gripper.size)
+    return set(of_steps) == {(steps,)} and set(of_observations) <= {steps + 1}
 
 
 def _outcome(success: list[bool]) -> tuple[bool, bool, int | None]:
@@ -469,6 +601,8 @@ class Replayed:
     """The recorded actions in an environment here, compared with the recording step by step."""
 
     success: list[bool]  # after each step
+    ending: Ending
+    instruction: str  # several are joined with semicolons
     differences: dict[int, float]  # by the step that differs, 0 is the reset: the largest of a number
     described: Mapping[str, Any]  # by the environment here
 
@@ -528,16 +662,34 @@ def replay_actions(cell: CellResults, episode: Episode, trajectory: Trajectory) 
         with env_side("reset"):
             begin = options_of_reset(env, key.episode, cell.settings.get("reset_options"))
         success: list[bool] = []
+        instructions: list[str] = []
         differences: dict[int, float] = {}
+        last: EnvStep | None = None
         for number, (obs, step) in enumerate(play_actions(env, key.seed, begin, trajectory.actions, images=False)):
             if (largest := _difference(trajectory, number, obs, step)) is not None:
                 differences[number] = largest
+            last = step
             success += [] if step is None else [step.success]
+            with env_side("step"):
+                [instruction] = env.instructions
+            is_over = number == len(trajectory.actions)
+            if not instructions or (env.several_tasks and not is_over and instruction != instructions[-1]):
+                instructions.append(instruction)
+        ending = _ending(last, len(success), env.max_steps)
         with env_side("describe"):
-            return Replayed(success, differences, env.describe())
+            return Replayed(success, ending, "; ".join(instructions), differences, env.describe())
     finally:
         with env_side("close"):
             env.close()
+
+
+def _ending(last: EnvStep | None, steps: int, limit: int) -> Ending:
+    """Return how an episode ended whose last step is `last`, as the episode's loop does."""
+    if last is not None and last.terminated:
+        return "terminated"
+    if steps >= limit or (last is not None and last.truncated):
+        return "truncated"
+    return "policy_done"
 
 
 def _is_plain(value: object) -> bool:
@@ -552,6 +704,8 @@ def _replay(cell: CellResults, episode: Episode, trajectory: Trajectory, *, trus
     subject = f"replay of {cell.env}#{episode.result.key.episode}@{episode.result.key.seed}"
     if cell.settings.get("robot") is not None:
         return Finding(subject, "not checked", "it was played on a real robot")
+    if not _has_one_length(trajectory):
+        return Finding(subject, "differs", "its recording has actions and observations of different numbers of steps")
     try:
         if not trust:
             require_harmless(cell)
@@ -561,17 +715,26 @@ def _replay(cell: CellResults, episode: Episode, trajectory: Trajectory, *, trus
     result, outcome, steps = episode.result, _outcome(played.success), len(played.success)
     first, largest = min(played.differences, default=None), max(played.differences.values(), default=0.0)
     differs = f"the numbers differ from step {first} of {steps} on, by at most {largest:.3g}"
+    if first is None:
+        differs = "every number is equal to the bit"
+    compared = {
+        "ending": (played.ending, result.ending),
+        "instruction": (played.instruction, result.instruction),
+    }
+    for name, (here, there) in compared.items():
+        if here != there:
+            return Finding(subject, "differs", f"its {name} is {here[:_LENGTH]!r} here, {there[:_LENGTH]!r} there")
     if outcome != (result.success_once, result.success_at_end, result.first_success):
         now, then = ("solved" if solved else "not solved" for solved in (outcome[0], result.success_once))
         return Finding(subject, "differs", f"{now} here, {then} there; {differs}")
     detail = f"{steps} actions, every state, reward and success to the bit"
     if first is not None:
         detail = f"the same outcome, other numbers; {differs}"
-    there, here = cell.described, played.described
+    described, described_here = cell.described, played.described
     odd = [
-        f"{name} {str(here.get(name))[:_LENGTH]}, there {str(there.get(name))[:_LENGTH]}"
-        for name in sorted(there.keys() | here.keys())
-        if there.get(name) != here.get(name)
+        f"{name} {str(described_here.get(name))[:_LENGTH]}, there {str(described.get(name))[:_LENGTH]}"
+        for name in sorted(described.keys() | described_here.keys())
+        if described.get(name) != described_here.get(name)
     ]
     if odd:
         detail += f"; the environment says of itself here: {'; '.join(odd)}"

@@ -105,7 +105,8 @@ def test_an_honest_bundle_holds_and_plays_again_to_the_bit(bundle: Path) -> None
     assert found.holds
     equal = {name for name, verdict in verdicts(found).items() if verdict == "equal"}
     assert equal == {
-        "digests", "database", "trajectories", "versions", "replay of tabletop#0@0", "replay of tabletop#1@1"
+        "digests", "database", "episodes", "trajectories", "versions",
+        "replay of tabletop#0@0", "replay of tabletop#1@1",
     }  # fmt: skip
     assert details(found, "replay of tabletop#1@1") == "8 actions, every state, reward and success to the bit"
 

@@ -36,6 +36,7 @@ class Episode:
     env_program: str | None = None  # digest of the files of its environment, None if installed
     policy_program: str | None = None  # the same for its policy
     beyond: bool = False  # whether it comes after the end of its stopped cell, or is no longer planned
+    unplanned: bool = False  # the latter of the two
 
     @property
     def counts(self) -> bool:
@@ -268,7 +269,10 @@ def _cell(row: dict[str, Any], episodes: tuple[Episode, ...], attempts: tuple[At
     parsed = {name: json.loads(row[name] or "{}") for name in names}
     each = row["planned"] // len(seeds)
     # After a resumption with fewer episodes, the others that were already played would be a biased selection.
-    episodes = tuple(replace(one, beyond=place_in_plan(one.result.key, seeds, each) is None) for one in episodes)
+    outside = [place_in_plan(one.result.key, seeds, each) is None for one in episodes]
+    episodes = tuple(
+        replace(one, beyond=is_outside, unplanned=is_outside) for one, is_outside in zip(episodes, outside, strict=True)
+    )
     stop, stopped_at = None, None
     if rule is not None:
         stop = StopConfig.model_validate_json(rule)
