@@ -256,7 +256,8 @@ class Stopped(command.Watchdog):
         super().start()
         self.trip("a person is in the way")
 
-command.RemoteAgent, command.Watchdog, command._DEVICES["keyboard"] = Still, Stopped, Seen
+import vlagents_ray.robot.loop as loop
+command.RemoteAgent, loop.Watchdog, command._DEVICES["keyboard"] = Still, Stopped, Seen
 sys.exit(command.main(sys.argv[1:]))
 """
     options = ["http://gpu-box:8000", "--leader", "keyboard", "--step", "0.01"]

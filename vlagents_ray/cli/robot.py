@@ -28,7 +28,16 @@ from vlagents_ray.errors import ConfigError, VLAgentsError
 from vlagents_ray.interface import Agent
 from vlagents_ray.robot.fit import Trained, require_fit
 from vlagents_ray.robot.limits import Limits
-from vlagents_ray.robot.loop import LoopReport, Restart, Robot, contract_of, import_class, robot_named, run_loop
+from vlagents_ray.robot.loop import (
+    LoopReport,
+    Restart,
+    Robot,
+    contract_of,
+    import_class,
+    robot_named,
+    robot_watchdog,
+    run_loop,
+)
 from vlagents_ray.robot.record import Recorder
 from vlagents_ray.robot.ros import RosRobot, read_settings
 from vlagents_ray.robot.safety import SOFT_START_S, Guard, Watchdog, measured_state
@@ -148,10 +157,7 @@ def _run(options: argparse.Namespace) -> LoopReport:
             robot.stop()
             say(f"stopped by the watchdog: {reason}")
 
-        silent_s = {"server": options.silent_s, "loop": hangs_s}
-        watchdog = Watchdog(stop, silent_s if topics is None else {**topics.silent_s, **silent_s})
-        if topics is not None:
-            topics.watchdog = watchdog
+        watchdog = robot_watchdog(robot, stop, {"server": options.silent_s, "loop": hangs_s})
         stack.enter_context(_restarting(watchdog, say))
         report = run_loop(
             robot, player, hz=hz, watchdog=watchdog, recorder=recorder, viewer=viewer, commands=commands,

@@ -45,7 +45,8 @@ class Robot(Protocol):
 
     A simulated robot may have the attribute `simulated = True`: it starts again by itself after a stop (see `restart`
     of `run_loop`). A robot may have an attribute `holds`, the reason why it must not move now, such as a camera that
-    hangs. While it is not None the robot is stopped; then the loop continues with a new observation.
+    hangs. While it is not None the robot is stopped; then the loop continues with a new observation. A class around
+    another robot derives from `vlagents_ray.robot.wrapper.RobotWrapper`, which keeps these attributes.
 
     `vlagents-ray robot`, its `check` and `vlagents_ray.robot.check.examine` use further attributes of a robot that has
     them: `contract`, what it gives and takes; `joint_names`, its joints in the order of an action, without grippers;
@@ -71,6 +72,21 @@ def contract_of(robot: Robot) -> Contract:
     """Return what a robot states of itself, with the names of its joints; empty if it states nothing."""
     stated, names = getattr(robot, "contract", None) or Contract(), tuple(getattr(robot, "joint_names", ()))
     return replace(stated, action=replace(stated.action, names=stated.action.names or names or None))
+
+
+def robot_watchdog(robot: Robot, stop: Callable[[str], None], silent_s: dict[str, float]) -> Watchdog:
+    """Return a watchdog that also watches the robot's own sources.
+
+    Args:
+        robot: The robot. Its attribute `silent_s`, if any, has further sources and their longest silences, s; its
+            attribute `watchdog`, if any, is set, so that the robot records their signs of life.
+        stop: As of `Watchdog`.
+        silent_s: As of `Watchdog`.
+    """
+    watchdog = Watchdog(stop, {**getattr(robot, "silent_s", {}), **silent_s})
+    if hasattr(robot, "watchdog"):
+        robot.watchdog = watchdog
+    return watchdog
 
 
 def import_class(option: str, name: str, methods: Sequence[str] = ()) -> Any:
@@ -181,7 +197,8 @@ def run_loop(
     """Reset an agent and let it drive a robot at a fixed rate, until it is done or the time is over.
 
     With the rest pose of `Guard.limits`, the robot goes there slowly after a run that ended without a stop, a pause, a
-    mark or an exception; a mark may come from afar, from where a robot can only be made to stop. The schedule is
+    mark or an exception; a mark may come from afar, from where a robot can only be made to stop. A stop ends this
+    motion as it ends any other. The schedule is
     absolute, so there is no drift; a tick that is over before it could begin is skipped and counted as
     missed. `robot.stop()` is called however the loop ends. If more than half of the ticks had no action of the policy,
     `LoopReport.mostly_safe` is logged as a warning. Signals such as SIGTERM end the loop if the caller turns them into
@@ -208,7 +225,8 @@ def run_loop(
             recorder with `interventions=True`.
         viewer: Shows the run as one episode (see `vlagents_ray.viewers`).
         real_time: Run the thread with SCHED_FIFO (see `vlagents_ray.robot.pacing.undisturbed`).
-        until: Ends the loop when it returns True; called before each tick, and after the last one.
+        until: Ends the loop when it returns True; called before each tick, and after the last one. This is not a stop:
+            with a rest pose the robot goes there. Use `Watchdog.trip` or `Control.stop` for a stop.
         commands: The commands of the live page, from `RemoteAgent(url, commands=...)`: pause, stop, mark.
 
     Returns:
@@ -348,6 +366,7 @@ class _Run:
         try:
             for command in self.guard.way_to_rest(last):
                 pacer.wait()
+                _observed(self.robot)  # so that the robot can tell that it must not move (`holds`)
                 self.control.update()
                 if self._held(Act(last)) is not None or self.control.state == "human" or self.control.over:
                     break

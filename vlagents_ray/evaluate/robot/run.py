@@ -326,7 +326,7 @@ class _RemainingTrials:
         policies = {trial.job.cell.contender: trial.job.cell for trial in left}
         for _, cell in sorted(policies.items(), key=lambda one: one[0]):  # an order that reveals nothing
             try:
-                rehearse(cell, self._factory, self._operator, obs)
+                rehearse(cell, self._robot, self._factory, self._operator, obs)
             except VLAgentsError as error:
                 raise from_code(error.code, f"policy {cell.contender!r}: {error}") from error
         for trial in left:

@@ -12,7 +12,9 @@ from typing import Any
 
 import numpy as np
 
+from vlagents_ray.chunking.control import Control
 from vlagents_ray.chunking.player import ChunkPlayer, PlayerSettings
+from vlagents_ray.client.commands import Command, CommandInbox
 from vlagents_ray.errors import CheckpointFailed, EnvFailed, InvalidAction, PolicyFailed, PolicyUnavailable
 from vlagents_ray.evaluate.episode.episode import EpisodeStats, transport_of
 from vlagents_ray.evaluate.episode.failures import env_side, policy_side
@@ -24,10 +26,13 @@ from vlagents_ray.evaluate.robot.operator import Operator
 from vlagents_ray.evaluate.workers.rollout import AgentFactory
 from vlagents_ray.interface import Act, Agent, Obs
 from vlagents_ray.naming import plain
-from vlagents_ray.robot import Guard, LoopReport, Robot, Watchdog, run_loop
+from vlagents_ray.robot import Guard, LoopReport, run_loop
+from vlagents_ray.robot.loop import robot_watchdog
 from vlagents_ray.robot.record import Recorder
 from vlagents_ray.robot.safety import measured_state
+from vlagents_ray.robot.wrapper import RobotWrapper
 
+_STOPPED = "stopped by the operator"
 _WAIT_S = 1.0  # deadline of a tick in the modes that wait for an answer
 
 
@@ -98,38 +103,57 @@ class PlayedTrial:
     ending: str  # in words that do not depend on the policy
 
 
-class WatchedRobot(Robot):
-    """A robot whose errors become `EnvFailed`."""
+class WatchedRobot(RobotWrapper):
+    """A robot whose errors become `EnvFailed`, and whose steps are counted."""
 
-    def __init__(self, robot: Robot) -> None:
-        self._robot = robot
-        self.simulated = getattr(robot, "simulated", False)
-        self.stats: EpisodeStats | None = None  # of the running trial
+    stats: EpisodeStats | None = None  # of the running trial
+    step_due: bool = False  # whether the player has returned the next action; the way to the rest pose has no steps
 
     def observe(self) -> Obs:
         with env_side("robot, observe"):
-            return self._robot.observe()
+            return super().observe()
 
     def apply(self, action: np.ndarray) -> None:
         with env_side("robot, apply"):
-            self._robot.apply(action)
-        if self.stats is not None:
+            super().apply(action)
+        if self.stats is not None and self.step_due:
+            self.step_due = False
             self.stats.steps += 1
             self.stats.actions.update(action.astype("<f4", copy=False).tobytes())
 
     def stop(self) -> None:
         with env_side("robot, stop"):
-            self._robot.stop()
+            super().stop()
+
+
+class _OperatorStop(CommandInbox):
+    """The operator's stop button, which the control loop reads before each motion, also on the way to the rest pose."""
+
+    def __init__(self, operator: Operator) -> None:
+        super().__init__()
+        self._operator = operator
+
+    def obey(self, control: Control) -> list[Command]:
+        if self._operator.stops() and not control.stopped:
+            control.stop(_STOPPED)
+        return super().obey(control)
 
 
 class _CountingPlayer(ChunkPlayer):
     """A chunk player that records the metadata of the policy's answers."""
 
     def __init__(
-        self, agent: Agent, stats: EpisodeStats, operator: Operator, settings: PlayerSettings, check: Guard
+        self,
+        agent: Agent,
+        stats: EpisodeStats,
+        robot: WatchedRobot,
+        operator: Operator,
+        settings: PlayerSettings,
+        check: Guard,
     ) -> None:
         super().__init__(agent, settings, check=check)
         self._stats = stats
+        self._robot = robot
         self._operator = operator
         self._chunk = -1
 
@@ -143,6 +167,7 @@ class _CountingPlayer(ChunkPlayer):
         self._operator.watch(obs)
         with policy_side("act"):
             act = super().act(obs)
+        self._robot.step_due = True
         number = act.info.get("chunk", self._chunk)
         if number != self._chunk:
             self._chunk = number
@@ -162,19 +187,18 @@ def play(
     settings, task = cell.on_robot
     deadline_s = _deadline_s(settings)
     stats = robot.stats = EpisodeStats(trial.job.key, instructions=[task.instruction])
-    watchdog = Watchdog(
-        lambda _: robot.stop(), {"server": settings.silent_s, "loop": max(0.2, 5 / settings.hz) + deadline_s}
-    )
+    hangs_s = max(0.2, 5 / settings.hz) + deadline_s
+    watchdog = robot_watchdog(robot, lambda _: robot.stop(), {"server": settings.silent_s, "loop": hangs_s})
     stopped = False
 
     def until() -> bool:
         nonlocal stopped
-        stopped = stopped or operator.stops()
-        return stopped or watchdog.control.stopped
+        stopped = stopped or _STOPPED in watchdog.control.stops
+        return watchdog.control.stopped
 
     with contextlib.ExitStack() as stack:
         stack.callback(setattr, robot, "stats", None)
-        agent, player = stack.enter_context(_player(cell, factory, stats, operator))
+        agent, player = stack.enter_context(_player(cell, factory, stats, robot, operator))
         recorder = None if recording is None else stack.enter_context(Recorder(recording, settings.hz))
         failed, report = None, LoopReport(settings.hz)
         try:
@@ -189,12 +213,15 @@ def play(
                 restart="manual",
                 recorder=recorder,
                 until=until,
+                commands=_OperatorStop(operator),
             )
         except CheckpointFailed:
             raise
         except PolicyFailed as error:
             failed = error
         for bark in report.barks:  # failures of infrastructure are not the policy's
+            if bark == _STOPPED:
+                continue
             if bark.startswith("server"):
                 raise PolicyUnavailable(f"the policy's server was silent: {bark}")
             raise EnvFailed(f"robot: the control loop was held up: {bark}")
@@ -204,12 +231,12 @@ def play(
         stats.ticks_held = report.safe_ticks
         result = stats.result(transport_of(agent), failed)
         # Without whether the policy considered the task finished, as only some policies ever do.
-        over = "stopped by the operator" if stopped else "the trial is over"
+        over = _STOPPED if stopped else "the trial is over"
         ending = over if failed is None else "the policy failed"
         return PlayedTrial(replace(result, env_seconds=None), dict(getattr(agent, "metadata", {})), ending)
 
 
-def rehearse(cell: EvalCase, factory: AgentFactory, operator: Operator, obs: Obs) -> None:
+def rehearse(cell: EvalCase, robot: WatchedRobot, factory: AgentFactory, operator: Operator, obs: Obs) -> None:
     """Run a policy once, without moving the robot.
 
     A mistake in the settings shows before the first trial. Work done on the first call, such as compilation, does not
@@ -217,7 +244,7 @@ def rehearse(cell: EvalCase, factory: AgentFactory, operator: Operator, obs: Obs
     """
     _, task = cell.on_robot
     unused = EpisodeStats(EpisodeKey(cell.env, 0, 0, cell.fingerprint))
-    with _player(cell, factory, unused, operator) as (_, player):
+    with _player(cell, factory, unused, robot, operator) as (_, player):
         player.initialize()
         with contextlib.suppress(InvalidAction):  # in a trial it is a failure of the policy
             player.reset(obs, task.instruction, **cell.policy_options)
@@ -226,7 +253,7 @@ def rehearse(cell: EvalCase, factory: AgentFactory, operator: Operator, obs: Obs
 
 @contextlib.contextmanager
 def _player(
-    cell: EvalCase, factory: AgentFactory, stats: EpisodeStats, operator: Operator
+    cell: EvalCase, factory: AgentFactory, stats: EpisodeStats, robot: WatchedRobot, operator: Operator
 ) -> Iterator[tuple[Agent, ChunkPlayer]]:
     """Yield a policy's agent and its player with the plan's settings; both are closed at the end."""
     settings, _ = cell.on_robot
@@ -237,6 +264,7 @@ def _player(
         player = _CountingPlayer(
             agent,
             stats,
+            robot,
             operator,
             PlayerSettings(
                 mode=settings.mode,

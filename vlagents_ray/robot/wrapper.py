@@ -1,0 +1,45 @@
+"""The base class of robots that wrap another robot."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from vlagents_ray.interface import Obs
+from vlagents_ray.robot.loop import Robot
+
+
+class RobotWrapper(Robot):
+    """A robot around another one, with all attributes of the inner robot.
+
+    Optional attributes of a `Robot`, such as `holds`, are read from the inner robot at each access and set there. A
+    subclass overrides the methods that it changes. Attributes of its own begin with an underscore or are declared in
+    its class.
+
+    Args:
+        robot: The inner robot.
+    """
+
+    def __init__(self, robot: Robot) -> None:
+        self._robot = robot
+
+    def observe(self) -> Obs:
+        return self._robot.observe()
+
+    def apply(self, action: np.ndarray) -> None:
+        self._robot.apply(action)
+
+    def stop(self) -> None:
+        self._robot.stop()
+
+    def __getattr__(self, name: str) -> Any:
+        if name.startswith("_"):  # also `_robot` itself, before `__init__` or in a copy
+            raise AttributeError(f"{type(self).__name__} has no attribute {name!r}")
+        return getattr(self._robot, name)
+
+    def __setattr__(self, name: str, value: Any) -> None:
+        if name.startswith("_") or hasattr(type(self), name):
+            super().__setattr__(name, value)
+        else:
+            setattr(self._robot, name, value)
