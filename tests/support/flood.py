@@ -22,6 +22,7 @@ from functools import cache, partial
 from pathlib import Path
 from typing import Any
 
+import hostile_images
 import numpy as np
 from asgi_server import served
 from dialect_server import ALL, METADATA
@@ -131,6 +132,12 @@ def _raw_frame() -> bytes:
     size = 2304 * 2400 * 3
     node = {"cameras": {"front": {"$": ["nd", 0, "|u1", [2304, 2400, 3]]}}}
     return b"".join(frame_layout.pack({"op": "reset", "obs": node}, [bytes(size)]))
+
+
+def _hostile(name: str) -> bytes:
+    """A small image whose decoding would take seconds, or as long as its structure may."""
+    seen = {"cameras": {"front": {"$": ["img", 0]}}}
+    return b"".join(frame_layout.pack({"op": "reset", "obs": seen}, [hostile_images.FILES[name](200_000)]))
 
 
 def _probe() -> bytes:
@@ -255,6 +262,10 @@ PARTS: dict[str, Callable[[], bytes]] = {
     "names": _names,
     "blobs": _blobs,
     "history": _history,
+    "scans": partial(_hostile, "JPEG: scans"),
+    "allowed scans": partial(_hostile, "JPEG: scans within the limit"),
+    "chunks": partial(_hostile, "PNG: empty chunks"),
+    "rows of no columns": partial(_hostile, "PNG: no columns"),
 }
 """The largest message in each part of the grammar of a frame; "images" is the largest that each way takes."""
 FRAMES = ("own port", "WS /v1/stream", "POST /v1/reset, frame", "shared memory")  # the ways that take a frame

@@ -5,13 +5,14 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
-from typing import TYPE_CHECKING, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 
 from vlagents_ray.errors import InvalidInput
 from vlagents_ray.images import jpeg_png
-from vlagents_ray.images.thread_map import thread_map
+from vlagents_ray.images.image_file import read_structure
+from vlagents_ray.images.thread_map import MOST_THREADS, thread_map
 
 if TYPE_CHECKING:
     from vlagents_ray.protocol.messages import Budget
@@ -21,7 +22,7 @@ T = TypeVar("T")
 NAMES = ("raw", "lossless", "jpeg")
 SUBSAMPLINGS = ("444", "422", "440", "420")
 
-_JPEG_S, _PNG_S = 1.7e-9, 7e-9  # s per byte of pixels on one core, either way: 1 to 2, and 6 to 12 ns
+_JPEG_S, _PNG_S = 1.7e-9, 7e-9  # time to encode on one core, s per byte of pixels: 1 to 2, and 6 to 12 ns
 
 
 @dataclass(frozen=True, slots=True)
@@ -67,35 +68,38 @@ def encode_files(cameras: Sequence[np.ndarray], codec: ImageCodec) -> list[bytes
 
 
 def decode_files(files: Sequence[bytes | memoryview], budget: Budget, names: Sequence[str] = ()) -> list[np.ndarray]:
-    """Decode JPEG or PNG files to (H, W, 3) uint8 RGB images, after reserving memory for all of them.
+    """Decode JPEG or PNG files to (H, W, 3) uint8 RGB images, after reserving memory and time for all of them.
 
-    Errors name the camera of a file if `names` has it.
+    Errors name the camera of a file if `names`, in the order of the files, has it.
 
     Raises:
         MalformedMessage: A file cannot be decoded.
-        MessageTooLarge: The images exceed the limits.
+        MessageTooLarge: The images, or the time to decode them, exceed the limits.
     """
-    most = budget.limits.pixels
 
-    def attributed(read: Callable[[bytes | memoryview, int], T], file: bytes | memoryview) -> T:
+    def attributed(convert: Callable[[Any], T], item: Any, index: int) -> T:
+        """Return `convert(item)`; its errors name the camera of the file at `index`."""
         try:
-            return read(file, most)
+            return convert(item)
         except InvalidInput as error:
-            camera = next((name for name, one in zip(names, files, strict=False) if one is file), "")
-            if not camera:
+            if index >= len(names):
                 raise
             message = str(error).removeprefix("image: ")
-            raise type(error)(f"camera {camera[:40]!r}: {message}") from error.__cause__
+            raise type(error)(f"camera {names[index][:40]!r}: {message}") from error.__cause__
 
-    size = sum(3 * height * width for height, width in [attributed(jpeg_png.size, file) for file in files])
-    budget.hold(size)
-    decode = partial(attributed, jpeg_png.decode)
+    read = partial(read_structure, max_pixels=budget.limits.pixels)
+    checked = [attributed(read, file, index) for index, file in enumerate(files)]
+    budget.hold(sum(file.image_bytes for file in checked))
 
-    if budget.serial or not files:
-        images = [decode(file) for file in files]
-    else:
-        is_jpeg = bytes(files[0][:3]) == jpeg_png.JPEG_MAGIC  # usually, so are the others
-        images = thread_map(decode, files, (_JPEG_S if is_jpeg else _PNG_S) * size)
+    def decode(index: int) -> np.ndarray:
+        return attributed(jpeg_png.decode_file, checked[index], index)
+
+    seconds = sum(file.decoding_s for file in checked)
+    threads = 1 if budget.serial else MOST_THREADS
+    scratch_bytes = sum(sorted(file.scratch_bytes for file in checked)[-threads:])
+    with budget.decoding(seconds, scratch_bytes):
+        indices = range(len(checked))
+        images = [decode(index) for index in indices] if budget.serial else thread_map(decode, indices, seconds)
     if budget.files is not None:
         budget.files.update((id(image), (image, file)) for image, file in zip(images, files, strict=True))
     return images

@@ -30,6 +30,7 @@ Result = TypeVar("Result")
 
 _LEAST_WORK_S = 0.4e-3  # s; two cameras of 224 x 224 in JPEG gain a fifth of a round trip
 _MOST_HELPERS = 3  # largest number of threads beside the caller's; robots have few cameras
+MOST_THREADS = 1 + _MOST_HELPERS
 
 
 def thread_map(function: Callable[[Item], Result], items: Sequence[Item], work_s: float) -> list[Result]:
@@ -37,7 +38,7 @@ def thread_map(function: Callable[[Item], Result], items: Sequence[Item], work_s
 
     The function does not wait for other calls of itself. An exception is that of the first item that raised one.
     """
-    threads = min(len(items), allowed(), 1 + _MOST_HELPERS)
+    threads = min(len(items), allowed(), MOST_THREADS)
     if threads < 2 or work_s < _LEAST_WORK_S:
         return [function(item) for item in items]
     todo = iter(range(len(items)))  # shared by all threads, so that a late helper delays nothing

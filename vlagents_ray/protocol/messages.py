@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import contextlib
 import ipaddress
 import socket
 import struct
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, ClassVar, Literal
@@ -185,6 +187,8 @@ def is_loopback(host: str) -> bool:
 DecodedFiles = dict[int, tuple[np.ndarray, "bytes | memoryview"]]
 """Each image with the file from which it was decoded, by the `id` of the image."""
 _JSON_FACTOR = 4  # size of the parsed Python objects per byte of JSON, within the limits of `frame_layout`
+_DECODING_S = 20e-9  # limit of the time to decode a request's images, s per byte of `decoded_bytes`: slow PNG files
+_LEAST_DECODING_S = 10e-3
 
 
 class Budget:
@@ -194,13 +198,13 @@ class Budget:
     replica's memory, and chooses the decoding thread: `vlagents_ray.serve.engine.admission.MessageAdmission`.
     """
 
-    __slots__ = ("_left", "files", "limits", "serial")
+    __slots__ = ("_left", "_seconds_left", "files", "limits", "serial")
 
     def __init__(self, limits: Limits) -> None:
         self.limits = limits
         self.serial = False  # whether images are decoded one after the other
         self.files: DecodedFiles | None = None  # receives the files of decoded images; None if not needed
-        self._left = limits.decoded_bytes
+        self._refill()
 
     def begin_message(self) -> None:
         """Count the message for its sender before any of it is parsed; raise an error if it is refused."""
@@ -211,7 +215,12 @@ class Budget:
 
     def begin(self, op: object, rank: object = "robot") -> None:
         """Begin the next request of the message after its header is parsed; raise an error if it is refused."""
+        self._refill()
+
+    def _refill(self) -> None:
+        """Set the budget of the next request."""
         self._left = self.limits.decoded_bytes
+        self._seconds_left = _LEAST_DECODING_S + _DECODING_S * self.limits.decoded_bytes
 
     def count(self, size: int) -> None:
         """Count `size` bytes of the request that are in memory already; raise `MessageTooLarge` over the limit."""
@@ -225,6 +234,22 @@ class Budget:
     def hold(self, size: int) -> None:
         """Count `size` bytes before they are allocated for the request; raise an error if they exceed a limit."""
         self.count(size)
+
+    @contextlib.contextmanager
+    def decoding(self, seconds: float, scratch_bytes: int) -> Iterator[None]:
+        """Count the decoding of images before it begins; raise an error if it exceeds a limit.
+
+        Args:
+            seconds: Its estimated time on one core, s.
+            scratch_bytes: Memory that it needs until it ends, beside the images, bytes.
+        """
+        self._seconds_left -= seconds
+        if self._seconds_left < 0:
+            raise MessageTooLarge(
+                f"request: decoding its images takes {-self._seconds_left:.3g} s longer than it may; send fewer or "
+                f"smaller ones, or raise `limits.decoded_bytes`, to which the time is in proportion"
+            )
+        yield
 
 
 # A probe tests the link. It is answered at once, without a session or the policy. It consists of b"VLA?", an unused

@@ -7,15 +7,16 @@ these limits apply before anything is decoded:
   in it when its header is parsed (429).
 - Its decoded size is bounded by `limits.decoded_bytes` (413). With the rate limit, that bounds a key's bytes a second.
 - All messages of a replica together take at most `limits.in_flight_bytes`; a quarter is reserved for robots (503).
-- Images of more than a megapixel and headers of more than 64 KiB are decoded on separate threads, those of simulations
-  on half of the cores, so that neither the policy's thread nor an event loop waits for them.
+- Images of more than a megapixel or 8 ms and headers of more than 64 KiB are decoded on separate threads, those of
+  simulations on half of the cores, so that neither the policy's thread nor an event loop waits for them.
 """
 
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from typing import TypeVar
 
@@ -25,7 +26,9 @@ from vlagents_ray.protocol.messages import Budget, Limits, Request
 
 T = TypeVar("T")
 
-INLINE_BYTES = 3 * 2**20  # decoded size (a megapixel, 8 ms of one core) above which another thread decodes
+# Above these another thread decodes: a megapixel of decoded bytes, and the time in which one core decodes such a JPEG.
+INLINE_BYTES = 3 * 2**20
+INLINE_S = 8e-3
 _ROBOTS_SHARE = 0.25  # share of the bytes in flight that is reserved for robots
 
 
@@ -94,7 +97,18 @@ class Admission:
 class MessageAdmission(Budget):
     """The admission of one message, until the message is answered or dropped. Not thread-safe."""
 
-    __slots__ = ("_admission", "_admit", "_decoded", "_held", "_index", "_inline", "_refusals", "_robot", "size")
+    __slots__ = (
+        "_admission",
+        "_admit",
+        "_decoded",
+        "_decoding_s",
+        "_held",
+        "_index",
+        "_inline",
+        "_refusals",
+        "_robot",
+        "size",
+    )
 
     def __init__(
         self,
@@ -124,6 +138,7 @@ class MessageAdmission(Budget):
         self._robot = robot
         self._held = 0  # bytes counted as in flight
         self._decoded = 0  # decoded bytes among `_held`
+        self._decoding_s = 0.0  # estimated time of decoding the images so far, s
         self._index = -1  # index of the current request
         self._refusals: list[VLAgentsError | None] = []  # result of `admit` for each request
         self._inline = inline
@@ -144,7 +159,7 @@ class MessageAdmission(Budget):
 
     def begin(self, op: object, rank: object = "robot") -> None:
         """Begin the next request, as in `Budget`; the first request is counted with its message."""
-        self._left = self.limits.decoded_bytes
+        self._refill()
         if rank == "simulation":
             self._robot = False
         if self._admit is not None:
@@ -176,12 +191,27 @@ class MessageAdmission(Budget):
         self.receive(size)
         self._decoded += size
 
+    @contextlib.contextmanager
+    def decoding(self, seconds: float, scratch_bytes: int) -> Iterator[None]:
+        """Count the decoding of images, as in `Budget`; raise `NeedsDecodingThread` if it takes too long here."""
+        self._decoding_s += seconds
+        if self._inline and self._decoding_s > INLINE_S:
+            raise NeedsDecodingThread
+        with super().decoding(seconds, scratch_bytes):
+            self.receive(scratch_bytes)
+            try:
+                yield
+            finally:
+                self._admission.release(scratch_bytes)
+                self._held -= scratch_bytes
+
     def decode_on_thread(self, read: Callable[[Budget], T]) -> Future[T]:
         """Decode with `read` on a decoding thread, and return the future; raise `PolicyUnavailable` after `close`."""
         self._admission.release(self._decoded)
         self._held -= self._decoded
         self._decoded = 0
-        self._left = self.limits.decoded_bytes
+        self._decoding_s = 0.0
+        self._refill()
         self._index = -1
         self._inline = False
         return self._admission.submit(lambda: read(self), self._robot)
