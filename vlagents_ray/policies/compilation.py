@@ -223,10 +223,14 @@ class CudaGraph:
 
 CompileMode = bool | Literal["auto", "graphs", "require"]
 
-# Largest error of a row of a core's result, as a share of the row's norm, by the coarsest type that it computes with:
-# compiled sums run in another order, and merged kernels keep float32 where the eager pass rounds between them. In
-# bfloat16, ten steps of a flow of 3.5 billion parameters differ by 0.067 from the same eager pass with fewer rows.
-TOLERANCE = {"float32": 1e-3, "float16": 1e-2, "bfloat16": 1e-1}
+# Errors of a row of a core's result are shares of the row's norm. Compiled sums run in another order, and merged
+# kernels keep float32 where the eager pass rounds between them. How much that changes depends on the checkpoint: it is
+# measured, as the error of the eager core with smaller batches and other roundings. Torch's programs had half of it.
+_ROUNDINGS = 2.0  # largest error of a program, as a multiple of that one
+_LEAST = 1e-3  # the error that is always accepted
+# The largest error that is ever accepted, by the coarsest type in which a core computes. In bfloat16, ten steps of a
+# flow of 3.5 billion parameters differ by 0.067 from the same eager pass with fewer rows.
+TOLERANCE = {"float32": _LEAST, "float16": 1e-2, "bfloat16": 1e-1}
 _SHOWN = 300  # characters of a compiler's error in the log
 # A compiled program replaces the graph of the eager core if its replay takes at most this share of the time: a smaller
 # gain may be noise, and only the graph computes as the eager pass does.
@@ -249,7 +253,7 @@ class Compilation:
         self.mode = mode
         self.sizes: list[int] = []  # batch sizes for which a core is compiled, ascending
         self.building: int | None = None  # the batch size whose programs are being made
-        self.capturing: str | None = None  # the tier of the program that is being made of a core with parts
+        self.tier_of_parts: str | None = None  # the tier that a core with parts now calls of them; None: it is open
         self.cores: list[Core] = []
         self.memories: dict[Any, GraphMemory] = {}  # by device
         self.graph_bytes = 0  # which CUDA graphs took on all devices
@@ -304,6 +308,15 @@ class Compilation:
             logger.info("compiled for %d rows in %.1f s: %s", size, time.monotonic() - began, used)
         self.graph_bytes = sum(memory.taken() for memory in self.memories.values())
 
+    @contextmanager
+    def parts(self, tier: str) -> Iterator[None]:
+        """Let cores call a tier of their parts within the context: eager functions, or torch's programs."""
+        self.tier_of_parts = tier
+        try:
+            yield
+        finally:
+            self.tier_of_parts = None
+
     def drop_graphs(self) -> None:
         """Free all CUDA graphs, since they read weights at fixed addresses; `add_size` makes them again."""
         if not self.memories:
@@ -333,8 +346,8 @@ class Core:
         rows, owner = len(tensors[0]), self._owner
         if not owner.mode or (self._parts and tensors[0].device.type != "cuda"):
             return self._function(*tensors)
-        if owner.capturing is not None:
-            compiled = owner.capturing == _COMPILED
+        if owner.tier_of_parts is not None:
+            compiled = owner.tier_of_parts == _COMPILED
             return self._compiled[rows](*map(_of_one_kind, tensors)) if compiled else self._function(*tensors)
         if owner.building is not None:
             own = rows == (self._rows or owner.building)
@@ -375,7 +388,7 @@ class Core:
     def _compared(self, tensors: Sequence[Any]) -> Any:
         """Return the eager result, once the programs are made; keep those whose results are near it."""
         wanted, size = self._function(*tensors), len(tensors[0])
-        tiers, limit = list(self._programs.get(size, ())), _tolerance([*tensors, *_each(wanted)])
+        tiers = list(self._programs.get(size, ()))
         if missing := size not in self._programs:
             self._programs[size], self._kinds[size] = {}, _row_kinds(tensors)
             both = self._owner.mode != "graphs" and all(
@@ -387,6 +400,7 @@ class Core:
             try:
                 program = self._made(tier, tensors) if missing else programs[tier]
                 error = _largest_error(program(*tensors), wanted)
+                limit = _LEAST if error <= _LEAST else self._limit(tensors, wanted)
             except Exception as failure:  # noqa: BLE001 - compilers raise any error
                 said = f"{type(failure).__name__}: {' '.join(str(failure).split())[:_SHOWN]}"
             else:
@@ -397,6 +411,26 @@ class Core:
             programs.pop(tier, None)
             self._failures.append(f"{self.name!r} by {tier}: {said}")
         return wanted
+
+    def _limit(self, tensors: Sequence[Any], wanted: Any) -> float:
+        """Return the largest error of a right program, as measured with the eager core on the same inputs.
+
+        The core runs with the first and the second half of the batch, and with other roundings. Another composition
+        alone often changes nothing, since the same kernels compute each row as before.
+        """
+        from vlagents_ray.policies.rounding import OtherRounding
+
+        rounding, rows = OtherRounding(), len(tensors[0])
+        sizes = [size for size in (rows // 2, rows - rows // 2) if size]
+        with self._owner.parts(_GRAPH):
+            halves = [
+                _each(rounding.run(self._function, *half))
+                for half in zip(*(tensor.split(sizes) for tensor in tensors), strict=True)
+            ]
+        results = tuple(map(require("torch").cat, zip(*halves, strict=True)))
+        types = rounding.types | {_type(tensor) for tensor in tensors}
+        most = max(TOLERANCE.get(name, 0.0) for name in types) or TOLERANCE["float32"]
+        return min(most, max(_LEAST, _ROUNDINGS * _largest_error(results, _each(wanted))))
 
     def _made(self, tier: str, tensors: Sequence[Any]) -> Any:
         """Return a tier's program for tensors of these shapes.
@@ -416,11 +450,8 @@ class Core:
             function = Capturable(function)
         if device not in owner.memories:
             owner.memories[device] = GraphMemory(device)
-        owner.capturing = tier
-        try:
+        with owner.parts(tier):
             return CudaGraph(function, inputs, owner.memories[device])
-        finally:
-            owner.capturing = None
 
     def _inputs(self, tensors: Sequence[Any]) -> list[Any]:
         """Return zeros of these shapes, in the memory of the inputs of more rows if there are such."""
@@ -473,7 +504,5 @@ def _largest_error(got: Any, wanted: Any) -> float:
     return float(require("torch").stack(errors).max())  # which is NaN if any of them is
 
 
-def _tolerance(tensors: Sequence[Any]) -> float:
-    """Return the tolerance of the coarsest type among tensors."""
-    types = {str(tensor.dtype).removeprefix("torch.") for tensor in tensors}
-    return max(TOLERANCE.get(name, 0.0) for name in types) or TOLERANCE["float32"]
+def _type(tensor: Any) -> str:
+    return str(tensor.dtype).removeprefix("torch.")

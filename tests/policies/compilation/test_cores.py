@@ -278,6 +278,123 @@ def test_the_rounding_of_a_program_is_accepted(compiler: CountingCompiler) -> No
     assert loaded(compile="require", batch_sizes=[1])[0].compilation.sizes == [1]
 
 
+class Bfloat16Step:
+    """A step of a flow in bfloat16: it reads little of the state, and both cameras by the same layers."""
+
+    def __init__(self, steps: int = 1, width: int = 64) -> None:
+        torch.manual_seed(0)
+        self.steps = steps
+        self.layers = torch.nn.ModuleList(torch.nn.Linear(width, width) for _ in range(8)).bfloat16()
+        self.cameras, self.state, self.actions = (torch.randn(n, width) / n**0.5 for n in (16, 8, 6))
+        self.output = torch.randn(width, 6) / width**0.5
+
+    def inputs(self, rows: int) -> tuple[Any, ...]:
+        return torch.randn(rows, 2, 16).bfloat16(), torch.randn(rows, 8).bfloat16(), torch.randn(rows, 6)
+
+    def __call__(self, cameras: Any, state: Any, actions: Any, layers: Any = None, dtype: Any = torch.bfloat16) -> Any:
+        layers = layers or self.layers
+        for step in range(self.steps):
+            front, wrist = (cameras.to(dtype) @ self.cameras.to(dtype)).unbind(1)
+            x = front + 0.5 * wrist + 0.2 * state.to(dtype) @ self.state.to(dtype)
+            x = x + actions.to(dtype) @ self.actions.to(dtype) + step / self.steps
+            for layer in layers:
+                x = x + layer(x).tanh()
+            actions = actions - (x @ self.output.to(dtype)).float() / self.steps
+        return actions
+
+
+def merged(step: Bfloat16Step) -> Callable[..., Any]:
+    """Return the step as kernels that keep float32 between the operations."""
+    layers = copy.deepcopy(step.layers).float()
+    return lambda *inputs: step(*inputs, layers=layers, dtype=torch.float32)
+
+
+def sums_in_parts(step: Bfloat16Step) -> Callable[..., Any]:
+    """Return the step with sums in another order: of two parts, each of which is rounded."""
+
+    def layer_of(layer: Any) -> Callable[[Any], Any]:
+        halves = list(zip(layer.weight.chunk(2, 1), (0, 1), strict=True))
+        return lambda x: sum(x.chunk(2, 1)[place] @ half.T for half, place in halves) + layer.bias
+
+    layers = [layer_of(layer) for layer in step.layers]
+    return lambda *inputs: step(*inputs, layers=layers)
+
+
+def first_layer_again(step: Bfloat16Step) -> Callable[..., Any]:
+    return lambda *inputs: step(*inputs, layers=[step.layers[0], *step.layers[:-1]])
+
+
+def row_of_the_neighbour(step: Bfloat16Step) -> Callable[..., Any]:
+    return lambda cameras, state, actions: step(cameras, torch.cat([state[1:], state[:1]]), actions)
+
+
+RIGHT: dict[str, Callable[[Bfloat16Step], Any]] = {
+    "the same": lambda step: step,
+    "merged kernels": merged,
+    "other sums": sums_in_parts,
+}
+WRONG: dict[str, Callable[[Bfloat16Step], Any]] = {
+    "velocities too large": lambda step: lambda *inputs: 1.05 * step(*inputs),
+    "state never seen": lambda step: lambda cameras, state, actions: step(cameras, 0 * state, actions),
+    "cameras exchanged": lambda step: lambda cameras, state, actions: step(cameras.flip(1), state, actions),
+    "actions too small": lambda step: lambda cameras, state, actions: step(cameras, state, 0.9 * actions),
+    "first layer again": first_layer_again,
+    "row of the neighbour": row_of_the_neighbour,
+}
+
+
+CASES = [(name, rows) for name in (*RIGHT, *WRONG) for rows in (1, 3, 8)]
+CASES.remove(("row of the neighbour", 1))
+
+
+@pytest.mark.parametrize("steps", [1, 10])
+@pytest.mark.parametrize(("name", "rows"), CASES)
+def test_only_programs_within_the_rounding_of_their_checkpoint_are_used(
+    monkeypatch: pytest.MonkeyPatch, name: str, rows: int, steps: int
+) -> None:
+    step, compilation = Bfloat16Step(steps), Compilation(True)
+    program = (RIGHT | WRONG)[name](step)
+    monkeypatch.setattr(torch, "compile", lambda *_, **__: program)
+    core = compilation.core("step", step)
+    with torch.inference_mode():
+        compilation.add_size(rows, lambda: core(*step.inputs(rows)))
+    assert compilation.sizes == ([rows] if name in RIGHT else [])
+
+
+def test_the_rounding_of_autocast_is_measured_too(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Inputs and results in float32 do not show that the core computes in bfloat16."""
+    step = Bfloat16Step()
+    layers = copy.deepcopy(step.layers).float()
+
+    def core_of(inputs: Any, dtype: Any = torch.bfloat16) -> Any:
+        with torch.autocast("cpu", dtype, enabled=dtype != torch.float32):
+            for layer in layers:
+                inputs = inputs + layer(inputs).tanh()
+        return inputs.float()
+
+    for wrong in (False, True):
+        compilation = Compilation(True)
+        program = (lambda x: 1.05 * core_of(x)) if wrong else (lambda x: core_of(x, torch.float32))
+        monkeypatch.setattr(torch, "compile", lambda *_, program=program, **__: program)
+        core = compilation.core("step", core_of)
+        with torch.inference_mode():
+            compilation.add_size(4, lambda core=core: core(torch.randn(4, 64)))  # type: ignore[misc]
+        assert compilation.sizes == ([] if wrong else [4])
+
+
+def test_a_measurement_of_rounding_draws_nothing(compiler: CountingCompiler) -> None:
+    """Policies draw from torch's generators, and act the same with any `compile`."""
+    compiler.change[2] = lambda out: out * 1.0015
+    before = torch.get_rng_state()
+    policy = Linear.from_config({"checkpoint": "none", "compile": True, "batch_sizes": [2]})
+    policy.initialize()
+    after = torch.get_rng_state()
+    torch.set_rng_state(before)
+    made()
+    assert policy.compilation.sizes == []
+    assert torch.equal(after, torch.get_rng_state())
+
+
 class Candidates(Linear):
     """A model that runs five rows for each of a batch, at most three at a time, as a planner tries plans."""
 

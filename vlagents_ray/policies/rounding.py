@@ -1,0 +1,58 @@
+"""Another rounding of the same computation, from which the noise of a checkpoint's own numbers is measured.
+
+It is Monte Carlo arithmetic (Parker 1997, https://web.cs.ucla.edu/~stott/mca/): each result of 16 bits is moved by a
+random part of its last place, as another order of sums or another kernel would move it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import torch
+from torch.utils._python_dispatch import TorchDispatchMode
+
+_ROUNDED = (torch.float16, torch.bfloat16)
+
+
+class OtherRounding(TorchDispatchMode):  # type: ignore[misc]
+    """A context in which results of 16 bits are rounded another way; it draws from no generator of the process."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.types: set[str] = set()  # of the results, such as "bfloat16"
+        self._generators: dict[Any, Any] = {}  # by device
+
+    def run(self, function: Callable[..., Any], *tensors: Any) -> Any:
+        """Return the function's result; casts of weights by `autocast` are not cached, as they are rounded here."""
+        cached = torch.is_autocast_cache_enabled()
+        torch.set_autocast_cache_enabled(False)
+        try:
+            with self:
+                return function(*tensors)
+        finally:
+            torch.set_autocast_cache_enabled(cached)
+
+    def __torch_dispatch__(
+        self, func: Any, types: Any, args: tuple[Any, ...] = (), kwargs: Mapping[str, Any] | None = None
+    ) -> Any:
+        result = func(*args, **(kwargs or {}))
+        if any(returned.alias_info is not None for returned in func._schema.returns):
+            return result  # a view, or an operation in place
+        if isinstance(result, tuple | list):
+            return type(result)(map(self._rounded, result))
+        return self._rounded(result)
+
+    def _rounded(self, result: Any) -> Any:
+        if not isinstance(result, torch.Tensor):
+            return result
+        self.types.add(str(result.dtype).removeprefix("torch."))
+        if result.dtype not in _ROUNDED:
+            return result
+        device = result.device
+        if device not in self._generators:
+            self._generators[device] = torch.Generator(device).manual_seed(0)
+        # In place, since a result may take a large part of the memory.
+        factors = torch.rand(result.shape, generator=self._generators[device], device=device)
+        factors.sub_(0.5).mul_(torch.finfo(result.dtype).eps).add_(1)
+        return factors.mul_(result).to(result.dtype)
