@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import logging
 from collections.abc import Callable, Iterator
+from contextlib import ExitStack
 from types import SimpleNamespace
 from typing import Any
 
@@ -12,7 +13,7 @@ import numpy as np
 import pytest
 import torch
 from replica_process import ReplicaProcess, model
-from shared_cpu_memory import GPU, SharedCpuMemory
+from shared_cpu_memory import GPU, ReaderCounts, SharedCpuMemory
 
 from vlagents_ray.errors import InvalidWeights, UnchangedWeights
 from vlagents_ray.learn.publisher import AppTarget
@@ -103,6 +104,60 @@ def test_nobody_holds_more_memory_after_pushes_than_before(
     else:
         del learner
         assert torch.cuda.memory_allocated() < first[1]  # nothing keeps what was handed over
+
+
+def test_temporary_values_are_freed_after_each_push(
+    replica: ReplicaProcess, device: str, memory: SharedCpuMemory | None
+) -> None:
+    """Learners push what they gathered or merged for that purpose, as those with FSDP or LoRA."""
+    app, learner = Application(replica), model(device)
+
+    def push() -> tuple[int, int]:
+        changed(learner)
+        merged = {name: value.detach().clone() for name, value in learner.state_dict().items()}
+        app.push(merged, PIN)
+        replica.ask("values")
+        in_limbo = 0 if memory is None else len(memory.counts.limbo)
+        del merged
+        return in_limbo, torch.cuda.memory_allocated() if device == "cuda" else 0
+
+    first = push()
+    assert first[0] == 0
+    assert [push() for _ in range(5)] == [first] * 5
+
+
+@pytest.mark.parametrize("readers", [0, 1, 2, 3])
+@pytest.mark.parametrize("late", [False, True])
+def test_memory_is_freed_however_often_it_was_read(memory: SharedCpuMemory, readers: int, late: bool) -> None:
+    values = {name: value.detach().clone() for name, value in model("cpu").state_dict().items()}
+    with ExitStack() as stack:
+        with shared(values) as handles:
+            for _ in range(readers):
+                with opened(handles) as named:
+                    if late:  # as the frames of an error keep values, beyond the learner's context
+                        stack.callback(list(named.values()).clear)
+        assert memory.counts.limbo == []
+        assert memory.counts.next == len(handles.storages) > 0
+    memory.counts.collect()
+    assert memory.counts.limbo == []
+
+
+def test_counts_with_another_layout_are_released_by_torch_itself(
+    memory: SharedCpuMemory, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    released: list[tuple[bytes, int]] = []
+
+    def release(counters: bytes, counter: int) -> None:
+        released.append((counters, counter))
+        ReaderCounts.release(counters.decode(), counter)
+
+    monkeypatch.setattr(torch.UntypedStorage, "_release_ipc_counter_cuda", release, raising=False)
+    monkeypatch.setattr(shared_values, "_FIRST_COUNT", 64 + 8 * 100)
+    with shared(model("cpu").state_dict()) as handles:
+        assert released == []
+    assert [counter for _, counter in released][::-1] == [one.counter for one in handles.storages.values()]
+    assert caplog.text.count("torch's counts of readers cannot be set (got 0 as the first value of one") == 1
+    assert memory.counts.limbo == []
 
 
 def test_the_learner_keeps_its_memory_until_the_replica_has_answered(

@@ -7,14 +7,20 @@ https://docs.nvidia.com/cuda/cuda-c-programming-guide/. As in `trainable`, torch
 
 from __future__ import annotations
 
+import logging
+import mmap
 import sys
 from collections.abc import Iterator, Mapping
 from contextlib import ExitStack, contextmanager
 from dataclasses import astuple, dataclass
+from functools import lru_cache
+from pathlib import Path
 from typing import Any
 
 from vlagents_ray.errors import PolicyUnavailable
 from vlagents_ray.weights.trainable import dtype_name, is_array, portable
+
+logger = logging.getLogger(__name__)
 
 
 class NotShared(PolicyUnavailable):
@@ -96,6 +102,7 @@ def shared(named: Mapping[str, Any]) -> Iterator[SharedValues]:
         NotShared: CUDA cannot share this kind of memory.
     """
     with ExitStack() as stack:
+        stack.callback(_MEMORY.collect)  # after all handles have ended
         others: dict[str, Any] = {}
         values, devices = SharedValues(gpu_of(named), {}, {}, others), set()
         for name, value in named.items():
@@ -140,6 +147,63 @@ def opened(values: SharedValues) -> Iterator[Mapping[str, Any]]:
         named.clear()  # frames of an error may refer to it
 
 
+_SHARED_MEMORY = Path("/dev/shm")  # noqa: S108 - where torch's file of counts is
+_FIRST_COUNT, _COUNT = 64, 8  # bytes before the counts in that file, and of each of them
+
+
+@contextmanager
+def counted_reads(counters: bytes, counter: int) -> Iterator[None]:
+    """Let torch free memory that it has sent after this context, whether and how often it was read.
+
+    Torch keeps such memory as long as its count of readers is not 0. The count is 1 at first, and each reader that ends
+    takes 1 away, so that it is wrong without a reader, and with several; being unsigned, it is then never 0 again.
+
+    Args:
+        counters: The name of torch's file of counts, which exists now.
+        counter: The index of the count in it.
+    """
+    count = _count(counters, counter)
+    try:
+        yield
+    finally:
+        if count is not None:
+            count[:] = bytes(_COUNT)
+        else:
+            sys.modules["torch"].UntypedStorage._release_ipc_counter_cuda(counters, counter)
+
+
+def _count(counters: bytes, counter: int) -> memoryview | None:
+    """Return the bytes of a count; None, with a warning, if the file is not laid out as expected."""
+    begin = _FIRST_COUNT + _COUNT * counter
+    try:
+        count = memoryview(_counts(counters))[begin : begin + _COUNT]
+    except OSError as error:
+        reason = str(error)
+    else:
+        value = int.from_bytes(count, sys.byteorder)
+        if len(count) == _COUNT and value == 1:
+            return count
+        reason = f"got {value} as the first value of one, want 1"
+    _warn_of_counts(reason)
+    return None
+
+
+@lru_cache(maxsize=16)  # once for each reason, and not for each value
+def _warn_of_counts(reason: str) -> None:
+    logger.warning(
+        "torch's counts of readers cannot be set (%s): memory that was pushed to replicas on the same GPU may stay "
+        "allocated; if it grows, use another version of torch, or other GPUs for the replicas",
+        reason,
+    )
+
+
+@lru_cache(maxsize=4)  # torch begins another file after 10,000 values
+def _counts(counters: bytes) -> mmap.mmap:
+    """Map torch's file of counts; the mapping stays valid when torch removes the file."""
+    with open(_SHARED_MEMORY / counters.decode().lstrip("/"), "r+b") as file:
+        return mmap.mmap(file.fileno(), 0)
+
+
 class _GpuMemory:
     """Shares memory of GPUs. Tests replace it, to share memory of the CPU if there is no GPU."""
 
@@ -170,11 +234,14 @@ class _GpuMemory:
             _, allocation, size, begin, counters, counter, _, _ = alias._share_cuda_()
         except RuntimeError as error:
             raise NotShared(f"this process cannot hand over its memory on {storage.device}: {error}") from error
-        try:
+        with counted_reads(counters, counter):
             yield StorageHandle(allocation, size, begin, counters, counter)
-        finally:
-            # Torch keeps memory that it has sent until a reader has released it, and there may have been no reader.
-            torch.UntypedStorage._release_ipc_counter_cuda(counters, counter)
+
+    def collect(self) -> None:
+        """Free the memory that was handed over, if nothing else refers to it."""
+        torch = sys.modules.get("torch")
+        if torch is not None and torch.cuda.is_initialized():
+            torch.cuda.ipc_collect()
 
     def opened(self, gpu: str, handle: StorageHandle) -> Any:
         """Return the storage of another process; raises `RuntimeError` if it cannot be reached."""
