@@ -86,7 +86,7 @@ class Replica:
         return client
 
     def shm(self, token: str) -> ShmTransport:
-        client = ShmTransport(asdict(self.local.address), Credentials(token))
+        client = ShmTransport(self.local.address, Credentials(token))
         client.connect(5)
         self.clients.callback(client.close)
         return client

@@ -15,7 +15,6 @@ import threading
 import time
 import zlib
 from collections.abc import Callable, Iterator
-from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 from urllib.parse import urlsplit
@@ -434,7 +433,7 @@ def test_a_robot_is_answered_while_anothers_image_is_decoded_and_order_is_kept(
     go_on, decoders = held_up
     own, near = endpoints
     robot, other = _connected(own), _connected(own)
-    local = ShmTransport(asdict(near.address), Credentials(""))
+    local = ShmTransport(near.address, Credentials(""))
     local.connect(10)
     for client in (robot, other):
         client.send(frame(reset()), 10)
@@ -489,7 +488,7 @@ def test_a_frame_in_shared_memory_is_decoded_beside_the_policy_too(
     robot = _connected(own)
     robot.send(frame(reset()), 10)
     assert decode_replies(robot.recv(10))[0].error is None
-    local = ShmTransport(asdict(near.address), Credentials(""))
+    local = ShmTransport(near.address, Credentials(""))
     local.connect(10)
     large = frame_layout.pack(reset(), [LARGE])
     monkeypatch.setattr("vlagents_ray.client.transports.shm.request_parts", lambda *_: large)
@@ -701,7 +700,7 @@ def test_a_key_over_its_rate_is_read_on_none_of_its_connections(replica: KeyedRe
 def test_an_act_in_compact_form_is_read_again_after_a_refusal(replica: KeyedReplica) -> None:
     """The layout of its arrays came with the first message, which was refused before it was parsed."""
     visitor = replica.visitor("right")
-    transport = ShmTransport(asdict(replica.local.address), Credentials(visitor.token))
+    transport = ShmTransport(replica.local.address, Credentials(visitor.token))
     transport.connect(10)
     assert transport.call([Request("reset", OBS)], 10)[0].error is None
     replica.known.change(visitor.name, rate=1e-6)

@@ -418,7 +418,7 @@ def over_shm(visitor: Visitor, when: str) -> str:
         visitor.become()
     refused = visitor.credential in ("none", "wrong")
     token = visitor.token if when == "after" and not refused else visitor.shown
-    transport = ShmTransport(asdict(replace(address, keyed=when != "before")), Credentials(token or ""))
+    transport = ShmTransport(replace(address, keyed=when != "before"), Credentials(token or ""))
     with contextlib.closing(transport):
         transport.connect(ANSWER_S)
         if when == "after":

@@ -321,7 +321,7 @@ OBS = Obs({"front": IMAGE, "wrist": IMAGE.copy()}, state={"joints": np.zeros(7, 
 @contextlib.contextmanager
 def robot(where: Where) -> Iterator[ShmTransport]:
     """A robot of the replica, in a session."""
-    transport = ShmTransport(where["local"], Credentials("robot"))
+    transport = ShmTransport(LocalAddress(**where["local"]), Credentials("robot"))
     transport.connect(10)
     [reply] = transport.call([Request("reset", OBS)], 30)
     assert reply.error is None

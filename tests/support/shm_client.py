@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 import threading
-from dataclasses import asdict
 from typing import Any
 
 import numpy as np
@@ -47,6 +46,6 @@ def call(transport: ShmTransport, one: Request, timeout_s: float) -> Reply:
 
 
 def client(server: ShmServer) -> ShmTransport:
-    transport = ShmTransport(asdict(server.address))
+    transport = ShmTransport(server.address)
     transport.connect(5)
     return transport

@@ -14,7 +14,15 @@ from urllib.parse import urlsplit
 from vlagents_ray.contract import Contract
 from vlagents_ray.errors import ConfigError, DeadlineExceeded, NoReplica, PolicyUnavailable, UnknownApp, VLAgentsError
 from vlagents_ray.interface import OF_THE_LOOP
-from vlagents_ray.protocol.messages import PROTOCOL_VERSION, Reply, Request, boot_id, is_loopback
+from vlagents_ray.protocol.messages import (
+    PROTOCOL_VERSION,
+    LocalAddress,
+    Reply,
+    Request,
+    boot_id,
+    is_loopback,
+    read_address,
+)
 
 if TYPE_CHECKING:
     from vlagents_ray.client.transports.base import CodecChoice, Transport
@@ -90,20 +98,21 @@ class Connection:
         self._connected(self.transport.connect(self._connect_timeout_s if timeout_s is None else timeout_s))
 
     def _connected(self, metadata: dict[str, Any]) -> None:
-        """Store the metadata of the replica to which the transport has connected."""
-        if metadata.get("protocol") != PROTOCOL_VERSION:
+        """Store the metadata of the replica to which the transport has connected; close it if they are invalid."""
+        try:
+            if metadata.get("protocol") != PROTOCOL_VERSION:
+                raise ConfigError(
+                    f"{self.url}: speaks protocol {metadata.get('protocol')}, this client {PROTOCOL_VERSION}; "
+                    f"upgrade the older of the two"
+                )
+            contract = metadata.get("contract")
+            self.contract = None if contract is None else Contract.from_json(contract)
+            local = read_address(LocalAddress, metadata.get("local"))
+        except VLAgentsError:
             self.transport.close()
-            raise ConfigError(
-                f"{self.url}: speaks protocol {metadata.get('protocol')}, this client {PROTOCOL_VERSION}; "
-                f"upgrade the older of the two"
-            )
-        contract = metadata.get("contract")
-        self.contract = None if contract is None else Contract.from_json(contract)
+            raise
         # A tunnel to another machine also begins at a loopback address.
-        local = metadata.get("local")
-        near = (
-            local is not None and local["boot_id"] == boot_id() != "" and is_loopback(urlsplit(self.url).hostname or "")
-        )
+        near = local is not None and local.boot_id == boot_id() != "" and is_loopback(urlsplit(self.url).hostname or "")
         self.codec.connected(near=near)
         self._silent, self._silent_since = False, None  # even if the transport is unchanged
         self.metadata = metadata

@@ -11,6 +11,8 @@ import time
 from collections.abc import Sequence
 from typing import Any, NamedTuple, cast
 
+import numpy as np
+
 from vlagents_ray.errors import (
     MalformedMessage,
     MessageTooLarge,
@@ -244,18 +246,35 @@ def _read_reply(node: dict[str, Any], reader: ValueReader) -> Reply:
         request_id=str(node.get("request_id", "")),
         step=_step(node),
         draining=bool(node.get("draining")),
-        timing=node.get("timing") or {},
+        timing=_timing(node.get("timing")),
     )
     if (error := node.get("error")) is not None:
         reply.error = read_error(error)
     elif (act := node.get("act")) is not None:
         try:
-            reply.act = Act(reader.blob(act["action"]), bool(act["done"]), reader.value(act["info"]))
+            reply.act = Act(reader.blob(act["action"]), bool(act["done"]), _info(act["info"], reader))
         except (KeyError, TypeError) as error:
             raise MalformedMessage(f"reply: got {shown(act)}, want action, done and info") from error
+        if not isinstance(reply.act.action, np.ndarray):
+            raise MalformedMessage(f"reply: action: got {shown(reply.act.action)}, expected an array")
     else:
-        reply.info = reader.value(node.get("info") or {})
+        reply.info = _info(node.get("info") or {}, reader)
     return reply
+
+
+def _info(node: object, reader: ValueReader) -> dict[str, Any]:
+    value = reader.value(node)
+    if not isinstance(value, dict):
+        raise MalformedMessage(f"reply: info: got {shown(node)}, expected an object")
+    return value
+
+
+def _timing(node: object) -> dict[str, float]:
+    if node is None:
+        return {}
+    if not isinstance(node, dict) or not all(is_number(value) for value in node.values()):
+        raise MalformedMessage(f"reply: timing: got {shown(node)}, expected numbers by name")
+    return node
 
 
 def describe_error(error: VLAgentsError) -> dict[str, Any]:

@@ -7,13 +7,13 @@ import ipaddress
 import socket
 import struct
 from collections.abc import Iterator
-from dataclasses import dataclass, field
+from dataclasses import MISSING, dataclass, field, fields
 from pathlib import Path
-from typing import Any, ClassVar, Literal
+from typing import Any, ClassVar, Literal, TypeVar
 
 import numpy as np
 
-from vlagents_ray.errors import MalformedMessage, MessageTooLarge, VLAgentsError
+from vlagents_ray.errors import MalformedMessage, MessageTooLarge, VLAgentsError, shown
 from vlagents_ray.interface import Act, Obs
 
 PROTOCOL_VERSION = 1
@@ -145,6 +145,12 @@ class StreamAddress:
     port: int
     path: str  # unguessable: known only to clients that may read the metadata
 
+    def __post_init__(self) -> None:
+        if not 0 < self.port < 2**16:
+            raise MalformedMessage(f"metadata: stream: got port {self.port}, expected 1 to 65535")
+        if not (self.path.startswith(STREAM_PATH) and is_name(self.path)):
+            raise MalformedMessage(f"metadata: stream: got path {shown(self.path)}, expected {STREAM_PATH} and a name")
+
 
 @dataclass(frozen=True, slots=True)
 class PlasmaAddress:
@@ -156,6 +162,35 @@ class PlasmaAddress:
     # Ray's id of the channel that contains the frame or the arrays; flags as in `LocalAddress`.
     REQUEST: ClassVar[struct.Struct] = struct.Struct("<28sI")
     TAG: ClassVar[bytes] = b"VLA1"  # Ray's metadata of the channel's content: out-of-band buffers, to be joined
+
+
+Address = TypeVar("Address", LocalAddress, StreamAddress, PlasmaAddress)
+_ADDRESS_TYPES = {"str": str, "int": int, "bool": bool}  # by annotation
+
+
+def read_address(kind: type[Address], document: object) -> Address | None:
+    """Read an address in the metadata of a server, which may be hostile; None if the server has none.
+
+    Args:
+        kind: `LocalAddress`, `StreamAddress` or `PlasmaAddress`.
+        document: The entry of the metadata. Its further keys, of a newer server, are ignored.
+
+    Raises:
+        MalformedMessage: A key is missing, or its value has another type.
+    """
+    if document is None:
+        return None
+    if not isinstance(document, dict):
+        raise MalformedMessage(f"metadata: got {shown(document)}, expected the entries of a {kind.__name__}")
+    values: dict[str, Any] = {}
+    for entry in fields(kind):
+        if entry.name not in document and entry.default is not MISSING:
+            continue
+        value = document.get(entry.name)
+        if type(value) is not _ADDRESS_TYPES[str(entry.type)]:
+            raise MalformedMessage(f"metadata: {kind.__name__}.{entry.name}: got {shown(value)}, expected {entry.type}")
+        values[entry.name] = value
+    return kind(**values)
 
 
 def boot_id() -> str:

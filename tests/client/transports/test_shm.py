@@ -44,7 +44,7 @@ def connect_plasma(address: dict[str, Any] | None) -> None:
 
 def test_requests_to_a_server_that_hangs_take_no_more_memory_than_it_would_accept() -> None:
     with listening(f"\0{NAME}"):
-        transport = ShmTransport({"socket": NAME, "boot_id": boot_id()})
+        transport = ShmTransport(LocalAddress(NAME, boot_id()))
         transport.connect(5)
         obs = Obs({"front": np.zeros((64, 64, 3), np.uint8)})
         for number in range(2 * LocalAddress.FILES):
@@ -60,7 +60,7 @@ def test_a_server_of_another_user_is_sent_nothing(monkeypatch: pytest.MonkeyPatc
     monkeypatch.setattr("vlagents_ray.client.transports.shm.peer_uid", lambda _: os.getuid() + 1)
     for keyed in (False, True):
         with listening(f"\0{NAME}") as listener:
-            transport = ShmTransport({"socket": NAME, "boot_id": boot_id(), "keyed": keyed}, Credentials("vlr_x"))
+            transport = ShmTransport(LocalAddress(NAME, boot_id(), keyed=keyed), Credentials("vlr_x"))
             with pytest.raises(PolicyUnavailable, match=f"belongs to the user with the number {os.getuid() + 1}"):
                 transport.call([Request("act", Obs(), request_id="1")], 5)
             peer, _ = listener.accept()

@@ -14,7 +14,7 @@ import sys
 import threading
 import time
 from collections.abc import Iterator
-from dataclasses import asdict
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -143,8 +143,8 @@ def test_neither_descriptors_in_a_message_nor_a_killed_client_leave_anything(ser
         "import sys, time, numpy as np\n"
         "from vlagents_ray.client.transports.shm import ShmTransport\n"
         "from vlagents_ray import Obs\n"
-        "from vlagents_ray.protocol.messages import Request\n"
-        f"t = ShmTransport({asdict(endpoint.address)!r}); t.connect(5)\n"
+        "from vlagents_ray.protocol.messages import LocalAddress, Request\n"
+        f"t = ShmTransport({endpoint.address!r}); t.connect(5)\n"
         "obs = Obs({'front': np.zeros((64, 64, 3), np.uint8)})\n"
         "t.call([Request('reset', obs, request_id='a')], 5)\n"
         "print('ready', flush=True)\n"
@@ -212,7 +212,7 @@ def test_a_client_that_ends_while_its_batch_runs_harms_nobody() -> None:
     endpoint = ShmServer(engine, LIMITS, NoKey.OPEN)
     endpoint.open()
     engine.start()
-    one, other = (ShmTransport(asdict(endpoint.address)) for _ in range(2))
+    one, other = (ShmTransport(endpoint.address) for _ in range(2))
     for each, name in ((one, "first"), (other, "second")):
         call(each, Request("reset", Obs({}), name, request_id=name), 60)
     # The queue polls beside a batch once it has seen a slow one, and one before it that was another session's.
@@ -349,9 +349,9 @@ def test_a_client_that_reads_no_replies_is_cut_off(served: tuple[Engine, ShmServ
 
 
 def test_only_this_machine_is_reached_and_only_the_same_user_let_in(served: tuple[Engine, ShmServer]) -> None:
-    local = asdict(served[1].address)
+    local = served[1].address
     assert reaches(local)
-    assert not reaches(local | {"boot_id": "another machine"})
+    assert not reaches(replace(local, boot_id="another machine"))
     ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
     assert peer_uid(ours) == os.getuid()
     ours.close()
@@ -378,7 +378,7 @@ def test_what_could_not_be_sent_keeps_no_memory() -> None:
     with socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET) as deaf:
         deaf.bind(f"\0{name}")
         deaf.listen(1)
-        transport = ShmTransport({"socket": name, "boot_id": ""})
+        transport = ShmTransport(LocalAddress(name, boot_id=""))
         busy = [0]
         while len(busy) <= 20 or busy[-1] > busy[-20]:  # sent, or its time was over before, and given up
             with pytest.raises(DeadlineExceeded):

@@ -10,7 +10,6 @@ import sys
 import time
 from collections import Counter
 from collections.abc import Iterator
-from dataclasses import asdict
 from itertools import pairwise
 from types import FrameType
 from typing import Any, ClassVar
@@ -63,7 +62,7 @@ def serving(agent: Agent) -> Iterator[ShmTransport]:
     endpoint = ShmServer(engine, LIMITS, NoKey.OPEN)
     endpoint.open()
     engine.start()
-    transport = ShmTransport(asdict(endpoint.address))
+    transport = ShmTransport(endpoint.address)
     transport.connect(5)
     transport.call([Request("reset", OBS, request_id="reset")], 5)
     try:

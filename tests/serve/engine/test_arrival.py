@@ -11,7 +11,6 @@ import socket
 import threading
 import time
 from collections.abc import Iterator
-from dataclasses import asdict
 from typing import Any
 from urllib.parse import urlsplit
 
@@ -63,7 +62,7 @@ class Shm:
     """A client that can send without waiting for the answer."""
 
     def __init__(self, endpoint: ShmServer) -> None:
-        self._transport = ShmTransport(asdict(endpoint.address))
+        self._transport = ShmTransport(endpoint.address)
         self._socket = self._transport._open(5)
 
     def send(self, request: Request) -> None:

@@ -14,6 +14,7 @@ from typing import Any
 from urllib.parse import SplitResult, urlsplit
 
 from vlagents_ray.client.credentials import ANONYMOUS, KEY_VARIABLE, Credentials, require_plain, tls_failure
+from vlagents_ray.client.http_deadline import DeadlineSocket
 from vlagents_ray.client.transports.base import CodecChoice, ConnectReport, first_timeout_s
 from vlagents_ray.errors import (
     ConfigError,
@@ -52,7 +53,7 @@ class HttpTransport:
         self._url = http_url(url)
         self._codec = codec
         self._session = uuid.uuid4().hex
-        self._connection: http.client.HTTPConnection | None = None
+        self._connection: tuple[http.client.HTTPConnection, DeadlineSocket] | None = None
 
     def connect(self, timeout_s: float) -> dict[str, Any]:
         """Return the server's metadata once it answers; retries while it is not ready."""
@@ -120,13 +121,16 @@ class HttpTransport:
     def close(self) -> None:
         """Close the connection; the next one may reach another replica."""
         if self._connection is not None:
-            self._connection.close()
+            connection, _ = self._connection
+            connection.close()
             self._connection = None
 
     def _exchange(
         self, method: str, path: str, body: bytes | None, headers: dict[str, str], timeout_s: float
     ) -> tuple[int, str, bytes]:
-        connection = self._open(timeout_s)
+        begun = time.monotonic()
+        connection, deadline_socket = self._open(timeout_s)
+        deadline_socket.begin_exchange(timeout_s - (time.monotonic() - begun))
         try:
             connection.request(method, self._url.path.rstrip("/") + path, body, headers | self._credentials.headers)
             answer = connection.getresponse()
@@ -148,8 +152,8 @@ class HttpTransport:
             self.close()
             raise ConnectionLost(f"{self._url.geturl()}: {type(error).__name__}: {error}") from error
 
-    def _open(self, timeout_s: float) -> http.client.HTTPConnection:
-        if self._connection is not None and _closed_by_peer(self._connection.sock):
+    def _open(self, timeout_s: float) -> tuple[http.client.HTTPConnection, DeadlineSocket]:
+        if self._connection is not None and _closed_by_peer(self._connection[0].sock):
             self.close()
         if self._connection is None:
             host, port = self._url.hostname or "", self._url.port
@@ -166,8 +170,7 @@ class HttpTransport:
             except OSError as error:
                 raise NoReplica(f"{self._url.geturl()}: cannot connect ({error}); is it running?") from error
             connection.sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-            self._connection = connection
-        self._connection.sock.settimeout(timeout_s)
+            self._connection = connection, DeadlineSocket.install(connection)
         return self._connection
 
 
@@ -210,5 +213,5 @@ def refusal(status: int, kind: str, body: bytes) -> VLAgentsError:
 def _json(body: bytes) -> Any:
     try:
         return json.loads(body)
-    except ValueError:
+    except (ValueError, RecursionError):  # no JSON, or a hostile server's
         return None

@@ -14,7 +14,7 @@ from vlagents_ray.client.transports.serve_handle import HandleTransport, PlasmaT
 from vlagents_ray.client.transports.shm import ShmTransport, reaches
 from vlagents_ray.client.transports.websocket import WebSocketTransport
 from vlagents_ray.errors import ConfigError, MessageTooLarge, NotReset, PolicyUnavailable
-from vlagents_ray.protocol.messages import Reply, Request, boot_id
+from vlagents_ray.protocol.messages import LocalAddress, Reply, Request, boot_id, read_address
 
 TransportName = Literal["auto", "shm", "plasma", "websocket", "http", "handle"]
 
@@ -51,12 +51,12 @@ class AutoTransport:
         metadata_source = handle or HttpTransport(self._url, self._codec, self._credentials, boot_id())
         try:
             metadata = metadata_source.connect(timeout_s)
+            local = read_address(LocalAddress, metadata.get("local"))
         except BaseException:
             metadata_source.close()
             raise
         left_s = max(1.0, deadline - time.monotonic())
-        local = metadata.get("local")
-        if handle is not None and not self._only_shm and local and local["keyed"] and not self._credentials.api_key:
+        if handle is not None and not self._only_shm and local and local.keyed and not self._credentials.api_key:
             local = None  # a client in the cluster only needs a key for this endpoint
         shm = self._shm(local, left_s)
         if shm is not None or handle is None:
@@ -94,8 +94,8 @@ class AutoTransport:
             self._chosen.close()
             self._chosen = self._handle = None
 
-    def _shm(self, local: dict[str, Any] | None, timeout_s: float) -> ShmTransport | None:
-        if not local or not reaches(local):
+    def _shm(self, local: LocalAddress | None, timeout_s: float) -> ShmTransport | None:
+        if local is None or not reaches(local):
             if self._only_shm:
                 raise ConfigError(f"{self._url}: transport 'shm' needs the policy on this machine; it is on another")
             return None

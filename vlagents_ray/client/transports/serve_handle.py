@@ -17,7 +17,7 @@ from vlagents_ray.client.transports.shm import UnixTransport
 from vlagents_ray.errors import ConfigError, ConnectionLost, DeadlineExceeded, PolicyUnavailable, VLAgentsError
 from vlagents_ray.images.codecs import RAW
 from vlagents_ray.protocol.frames import decode_replies, encode_requests, request_parts
-from vlagents_ray.protocol.messages import LocalAddress, PlasmaAddress, Reply, Request, boot_id
+from vlagents_ray.protocol.messages import LocalAddress, PlasmaAddress, Reply, Request, boot_id, read_address
 from vlagents_ray.ray_tools import private
 
 _PAUSE_S = 0.2  # s before requesting another replica in place of a lost one
@@ -227,15 +227,16 @@ class PlasmaTransport(UnixTransport):
                 f"serve://{self._app}: transport 'plasma' needs a process on a node of the cluster; "
                 f"a Ray client (ray://) is none: use http://"
             )
-        if (address := metadata.get("plasma")) is None:
+        address = read_address(PlasmaAddress, metadata.get("plasma"))
+        if address is None:
             raise ConfigError(f"serve://{self._app}: its replica offers no plasma endpoint; use transport 'handle'")
-        if address["node"] != node:
+        if address.node != node:
             raise ConfigError(
                 f"serve://{self._app}: transport 'plasma' needs the replica on this node ({node[:8]}), the chosen one "
-                f"is on {address['node'][:8]}; use transport 'handle', or 'auto'"
+                f"is on {address.node[:8]}; use transport 'handle', or 'auto'"
             )
         self._handle = handle
-        self._server = PlasmaAddress(**address).socket
+        self._server = address.socket
         self._open(timeout_s)
 
     def _is_free(self) -> bool:

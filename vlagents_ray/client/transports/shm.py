@@ -16,7 +16,7 @@ import time
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import numpy as np
 
@@ -191,9 +191,9 @@ class _Memory:
     busy: bool = False  # the server may still read it
 
 
-def reaches(local: dict[str, Any]) -> bool:
-    """Return whether the server with `local` in its metadata is on this machine and usable by this process."""
-    return hasattr(os, "memfd_create") and local["boot_id"] == boot_id() != ""
+def reaches(local: LocalAddress) -> bool:
+    """Return whether the server with this address is on this machine and usable by this process."""
+    return hasattr(os, "memfd_create") and local.boot_id == boot_id() != ""
 
 
 class ShmTransport(UnixTransport):
@@ -201,10 +201,9 @@ class ShmTransport(UnixTransport):
 
     name: ClassVar[str] = "shm"
 
-    def __init__(self, local: dict[str, Any], credentials: Credentials = ANONYMOUS) -> None:
-        """Set the server; `local` is the entry for this endpoint in its metadata."""
+    def __init__(self, address: LocalAddress, credentials: Credentials = ANONYMOUS) -> None:
+        """Set the server by its address, `local` in its metadata."""
         super().__init__()
-        address = LocalAddress(**local)
         self._server = f"\0{address.socket}"
         self._key = (credentials.api_key or "-") if address.keyed else None
         self._memories: list[_Memory] = []

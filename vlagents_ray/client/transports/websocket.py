@@ -31,7 +31,15 @@ from vlagents_ray.client.transports.http import HttpTransport, http_url, refusal
 from vlagents_ray.errors import ConnectionLost, DeadlineExceeded, MessageTooLarge, NoReplica, PolicyUnavailable
 from vlagents_ray.protocol.frame_layout import Buffer
 from vlagents_ray.protocol.frames import decode_replies, request_parts
-from vlagents_ray.protocol.messages import DEFAULT_LIMITS, SERVERS_MACHINE, STREAM_BYTES, Reply, Request, StreamAddress
+from vlagents_ray.protocol.messages import (
+    DEFAULT_LIMITS,
+    SERVERS_MACHINE,
+    STREAM_BYTES,
+    Reply,
+    Request,
+    StreamAddress,
+    read_address,
+)
 from vlagents_ray.protocol.websocket_frames import ReceiveBuffer, frame_head
 
 logger = logging.getLogger(__name__)
@@ -262,8 +270,8 @@ class WebSocketTransport:
 
     def connect_to(self, metadata: dict[str, Any], timeout_s: float) -> None:
         """Connect like `connect`, but to the replica with this metadata."""
-        stream = metadata.get("stream")
-        self._address = StreamAddress(**stream) if stream and self._base.scheme == "http" else None
+        stream = read_address(StreamAddress, metadata.get("stream"))
+        self._address = stream if self._base.scheme == "http" else None
         self._stream(timeout_s)
 
     def call(self, requests: Sequence[Request], timeout_s: float) -> list[Reply]:

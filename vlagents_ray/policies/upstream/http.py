@@ -9,13 +9,13 @@ import json
 import re
 import select
 import socket
-import ssl
 from collections.abc import Mapping, Sequence
 from typing import Any, ClassVar
 from urllib.parse import urlsplit
 
 import numpy as np
 
+from vlagents_ray.client.http_deadline import DeadlineSocket
 from vlagents_ray.errors import ConnectionLost, InvalidObservation, MessageTooLarge, PolicyUnavailable, VLAgentsError
 from vlagents_ray.policies.upstream.client import Answer, ClientOptions, UpstreamClient
 from vlagents_ray.wire import json_numpy, openpi, openvla
@@ -39,7 +39,7 @@ class HttpClient(UpstreamClient):
         self._headers = {"Content-Type": self.media_type, "Accept": self.media_type}
         if options.key is not None:
             self._headers["Authorization"] = f"Bearer {options.key}"
-        self._connection: http.client.HTTPConnection | None = None
+        self._connection: tuple[http.client.HTTPConnection, DeadlineSocket] | None = None
 
     @abc.abstractmethod
     def encode(self, observation: Mapping[str, Any]) -> bytes:
@@ -51,13 +51,15 @@ class HttpClient(UpstreamClient):
 
     @property
     def is_open(self) -> bool:
-        sock = self._connection.sock if self._connection is not None else None
-        if sock is None:
+        if self._connection is None:
             return False
-        if isinstance(sock, ssl.SSLSocket):
+        connection, _ = self._connection
+        if connection.sock is None:
+            return False
+        if isinstance(connection, http.client.HTTPSConnection):
             return True  # readable data may be a TLS session ticket
         ended = select.poll()  # uvicorn closes a connection that is idle for 5 s
-        ended.register(sock, select.POLLIN)
+        ended.register(connection.sock, select.POLLIN)
         return not ended.poll(0)
 
     def connect(self, timeout_s: float) -> dict[str, Any]:
@@ -84,9 +86,8 @@ class HttpClient(UpstreamClient):
             connection.close()
             raise self.unreachable(error) from error
         connection.sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-        connection.sock.settimeout(self.options.timeout_s)
         connection.auto_open = 0
-        self._connection = connection
+        self._connection = connection, DeadlineSocket.install(connection)
 
     def ask(self, observations: Sequence[Mapping[str, Any]]) -> list[Answer]:
         [observation] = observations
@@ -96,9 +97,11 @@ class HttpClient(UpstreamClient):
         if self._connection is None:
             raise self.closed()
         most = self.options.limits.body_bytes
+        connection, deadline_socket = self._connection
+        deadline_socket.begin_exchange(self.options.timeout_s)
         try:
-            self._connection.request(method, path, content, self._headers)
-            response = self._connection.getresponse()
+            connection.request(method, path, content, self._headers)
+            response = connection.getresponse()
             body = response.read(most + 1)
         except (http.client.HTTPException, OSError) as error:
             raise self.lost(error) from error
@@ -115,7 +118,8 @@ class HttpClient(UpstreamClient):
 
     def close(self) -> None:
         if self._connection is not None:
-            self._connection.close()
+            connection, _ = self._connection
+            connection.close()
             self._connection = None
 
 

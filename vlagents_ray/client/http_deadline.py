@@ -1,0 +1,79 @@
+"""A socket for `http.client` whose exchanges end by a deadline, however slowly the server sends.
+
+The time limit of a plain socket holds for each read: a server that sends a byte now and then would keep its client
+waiting for ever.
+"""
+
+from __future__ import annotations
+
+import http.client
+import io
+import math
+import socket
+import time
+from typing import IO, Any, cast
+
+from vlagents_ray.protocol.frame_layout import Buffer
+
+
+class DeadlineSocket:
+    """The part of a connected socket that `http.client` uses, with one time limit for all of an exchange."""
+
+    def __init__(self, sock: socket.socket) -> None:
+        self._socket = sock
+        self._deadline = math.inf  # time.monotonic()
+
+    @classmethod
+    def install(cls, connection: http.client.HTTPConnection) -> DeadlineSocket:
+        """Replace the socket of an open connection."""
+        installed = cls(connection.sock)
+        connection.sock = cast(socket.socket, installed)
+        return installed
+
+    def begin_exchange(self, timeout_s: float) -> None:
+        """Set the time, s, until which the next request must be sent, and its whole answer received."""
+        self._deadline = time.monotonic() + timeout_s
+
+    def apply_deadline(self) -> None:
+        """Limit the next operation of the socket to the time that is left; raises `TimeoutError` if none is."""
+        left_s = self._deadline - time.monotonic()
+        if left_s <= 0:
+            raise TimeoutError("timed out")
+        self._socket.settimeout(None if math.isinf(left_s) else left_s)
+
+    def sendall(self, data: Buffer) -> None:
+        """Send all of it. A TLS socket's own `sendall` would apply the time limit to each record."""
+        remaining = memoryview(data).cast("B")
+        while remaining:
+            self.apply_deadline()
+            remaining = remaining[self._socket.send(remaining) :]
+
+    def makefile(self, mode: str) -> IO[bytes]:
+        """Return a buffered reader of one answer, for `http.client.HTTPResponse`."""
+        if mode != "rb":
+            raise ValueError(f"mode: expected 'rb', got {mode!r}")
+        return io.BufferedReader(_AnswerReader(self, cast(io.RawIOBase, self._socket.makefile("rb", buffering=0))))
+
+    def fileno(self) -> int:
+        return self._socket.fileno()
+
+    def close(self) -> None:
+        self._socket.close()
+
+
+class _AnswerReader(io.RawIOBase):
+    """Reads a socket; each read has the time that is left of the exchange."""
+
+    def __init__(self, deadline_socket: DeadlineSocket, raw: io.RawIOBase) -> None:
+        self._deadline_socket, self._raw = deadline_socket, raw
+
+    def readable(self) -> bool:
+        return True
+
+    def readinto(self, buffer: Any) -> int | None:
+        self._deadline_socket.apply_deadline()
+        return self._raw.readinto(buffer)
+
+    def close(self) -> None:
+        self._raw.close()  # `http.client` may have closed the socket already, which stays open until now
+        super().close()
