@@ -122,8 +122,8 @@ class Still(Agent):
         state={"joints": StateSpec(2)}, gripper=True, action=ActionSpec(dim=3)
     )
 
-    def __init__(self, **metadata: object) -> None:
-        self.metadata = metadata
+    def __init__(self, statistics: dict[str, object] | None = None) -> None:
+        self.statistics = statistics
 
     def act(self, obs: Obs) -> Act:
         return Act(np.zeros((4, 3), np.float32))
@@ -171,12 +171,13 @@ def test_the_command_compares_the_arm_in_the_order_of_the_contract(tmp_path: Pat
 
 def test_the_statistics_are_those_of_the_server_unless_a_file_is_named(caplog: pytest.LogCaptureFixture) -> None:
     stated = {"parts": ["gripper", "joints"], "observation.state": {"min": [0, -1, -2], "max": [1, 1, 0.5]}}
-    agent, said = Still(weights={"digest": "blake2b:0", "statistics": stated}), list[str]()
+    agent, said = Still(stated), list[str]()
+    words = ["http://gpu-box:8000", "--robot", "test_fit:Standing"]
     with caplog.at_level(logging.INFO):
-        _require_fit(parse(["http://gpu-box:8000"]), agent, Standing(0.9, -1.9), None, said.append)
+        _require_fit(parse(words), agent, Standing(0.9, -1.9), None, said.append)
     assert said[0] in caplog.text
     with pytest.raises(ContractMismatch, match=r"state\[1\] \(lift\): got 57"):
-        _require_fit(parse(["http://gpu-box:8000"]), agent, Standing(57, 0), None, said.append)
+        _require_fit(parse(words), agent, Standing(57, 0), None, said.append)
     said.clear()
-    _require_fit(parse(["http://gpu-box:8000"]), Still(weights=None), Standing(57, 0), None, said.append)
+    _require_fit(parse(words), Still(), Standing(57, 0), None, said.append)
     assert said == [], "nothing is known to compare with"

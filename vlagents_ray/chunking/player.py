@@ -244,6 +244,7 @@ class ChunkPlayer(Agent):
         if self._asker is not None:
             self._asker.settle()
         self._agent.initialize()
+        self.statistics = self._agent.statistics
         self._choose_safe()
 
     def reset(self, obs: Obs, instruction: str | None = None, **kwargs: Any) -> dict[str, Any]:

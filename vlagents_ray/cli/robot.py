@@ -16,6 +16,7 @@ import signal
 import sys
 import threading
 from collections.abc import Callable, Iterator, Sequence
+from functools import partial
 from typing import Any, get_args
 
 from vlagents_ray.chunking.buffer import ENSEMBLE, MERGES, Mode
@@ -23,17 +24,18 @@ from vlagents_ray.chunking.control import Leader
 from vlagents_ray.chunking.player import ChunkPlayer, PlayerSettings
 from vlagents_ray.client.agent import RemoteAgent
 from vlagents_ray.client.commands import CommandInbox
-from vlagents_ray.contract import Contract, require_match
+from vlagents_ray.contract import Contract
 from vlagents_ray.errors import ConfigError, VLAgentsError
 from vlagents_ray.interface import Agent
-from vlagents_ray.robot.fit import Trained, require_fit
+from vlagents_ray.robot.fit import Fit, Trained
 from vlagents_ray.robot.limits import Limits
 from vlagents_ray.robot.loop import (
     LoopReport,
     Restart,
     Robot,
-    contract_of,
+    fit_of,
     import_class,
+    opened,
     robot_named,
     robot_watchdog,
     run_loop,
@@ -142,11 +144,9 @@ def _run(options: argparse.Namespace) -> LoopReport:
         )  # fmt: skip
         player = stack.enter_context(ChunkPlayer(agent, settings, check=guard, override=leader))
         player.initialize()  # refuses unfit settings before anything is timed or moves
-        robot: Robot = topics or (SimulatedRobot(contract) if make_robot is None else make_robot())
-        stack.callback(getattr(robot, "close", lambda: None))
-        if topics is not None or make_robot is not None or options.trained_on is not None:
-            require_match(contract, contract_of(robot))
-            _require_fit(options, agent, robot, guard.limits, say)
+        make_robot = make_robot or partial(SimulatedRobot, contract)
+        robot: Robot = topics or stack.enter_context(opened(make_robot))
+        fit = _require_fit(options, agent, robot, guard.limits, say)
         recorder = None
         if options.record:
             recorder = stack.enter_context(Recorder(options.record, hz, interventions=leader is not None))
@@ -162,7 +162,7 @@ def _run(options: argparse.Namespace) -> LoopReport:
         report = run_loop(
             robot, player, hz=hz, watchdog=watchdog, recorder=recorder, viewer=viewer, commands=commands,
             instruction=options.instruction, seconds=options.seconds, restart=options.restart,
-            real_time=options.real_time,
+            real_time=options.real_time, fit=fit,
         )  # fmt: skip
         if report.outcome:
             say(f"marked as a {report.outcome} on the live page")
@@ -181,20 +181,20 @@ def _run(options: argparse.Namespace) -> LoopReport:
 
 def _require_fit(
     options: argparse.Namespace, agent: Agent, robot: Robot, limits: Limits | None, say: Callable[[str], None]
-) -> None:
+) -> Fit:
     """Show the first chunk beside the training of the checkpoint and the limits of the arm, and compare them."""
-    stated = (getattr(agent, "metadata", {}).get("weights") or {}).get("statistics")
-    if options.trained_on is None and stated is None and limits is None:
-        return
-    trained = Trained.from_statistics(stated or {}) if options.trained_on is None else Trained.read(options.trained_on)
-    obs, contract, names = robot.observe(), agent.contract or Contract(), getattr(robot, "joint_names", ())
-    agent.reset(obs, options.instruction)
-    chunk = agent.act(obs).rows()
-    for line in trained.drawn(chunk, limits, names):
-        say(line)
-        logger.info("%s", line)
-    state = trained.vector(obs, [*(contract.state or {}), *(["gripper"] if contract.gripper else [])])
-    require_fit(trained.misfits(state, chunk, limits, names), accept=options.accept_misfit)
+    trained = None if options.trained_on is None else Trained.read(options.trained_on)
+    fit = fit_of(agent, robot, limits, trained=trained, accept=options.accept_misfit)
+    is_default = options.robot is None and options.ros is None
+    if fit.compares and not (is_default and trained is None):
+        obs = robot.observe()
+        agent.reset(obs, options.instruction)
+        rows = agent.act(obs).rows()
+        for line in fit.drawn(rows):
+            say(line)
+            logger.info("%s", line)
+        fit.require(obs, rows)
+    return fit
 
 
 def _leader(

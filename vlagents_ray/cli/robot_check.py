@@ -15,11 +15,12 @@ import sys
 import time
 from collections.abc import Sequence
 from dataclasses import asdict, replace
+from functools import partial
 
 from vlagents_ray.client.agent import RemoteAgent
 from vlagents_ray.errors import VLAgentsError
 from vlagents_ray.robot.check import Operator, RobotReport, examine
-from vlagents_ray.robot.loop import Robot, robot_named
+from vlagents_ray.robot.loop import Robot, opened, robot_named
 from vlagents_ray.robot.mujoco_arm import SimulatedClock
 from vlagents_ray.robot.ros import RosRobot, read_settings
 
@@ -53,8 +54,9 @@ def _checked(options: argparse.Namespace, stack: contextlib.ExitStack) -> RobotR
         robot = stack.enter_context(RosRobot(read_settings(options.ros)))
     else:
         make = robot_named("robot", options.robot, options.robot_set)
-        robot = make(clock=SimulatedClock()) if options.robot.startswith("mujoco:") else make()
-        stack.callback(getattr(robot, "close", lambda: None))
+        if options.robot.startswith("mujoco:"):
+            make = partial(make, clock=SimulatedClock())
+        robot = stack.enter_context(opened(make))
     contract = None
     if options.policy is not None:
         with RemoteAgent(options.policy) as agent:

@@ -272,6 +272,7 @@ class RemoteAgent(Agent):
     def initialize(self) -> None:
         """Connect, waiting for the server to become ready; raises `PolicyUnavailable` if it does not."""
         self._connection.open()
+        self.statistics = ((self._connection.metadata or {}).get("weights") or {}).get("statistics")
 
     def reset(
         self,

@@ -125,6 +125,42 @@ class Trained:
         return lines
 
 
+@dataclass(frozen=True, slots=True)
+class Fit:
+    """The numbers of a policy compared with those of an arm, before the first motion (see `loop.fit_of`)."""
+
+    trained: Trained
+    limits: Limits | None = None  # of the arm
+    names: tuple[str, ...] = ()  # of the arm's joints, by its driver
+    parts: tuple[str, ...] = ()  # of the state, in order, if the training names none
+    accept: bool = False  # whether misfits are only logged
+
+    @property
+    def compares(self) -> bool:
+        """Whether there is anything to compare with."""
+        return self.trained != Trained() or self.limits is not None
+
+    def drawn(self, rows: np.ndarray) -> list[str]:
+        """Draw the first chunk, (H, D), beside the training's actions and the limits: a line for each number."""
+        return self.trained.drawn(rows, self.limits, self.names)
+
+    def require(self, obs: Obs | None, rows: np.ndarray | None) -> None:
+        """Compare an observation of the arm at rest and the policy's first chunk with the training and the limits.
+
+        Args:
+            obs: The observation; None compares only the chunk.
+            rows: The chunk, (H, D); None compares only the observation.
+
+        Raises:
+            ContractMismatch: Something does not fit, and `accept` is off.
+        """
+        if not self.compares:
+            return
+        state = None if obs is None else self.trained.vector(obs, self.parts)
+        limits = None if obs is None else self.limits
+        require_fit(self.trained.misfits(state, rows, limits, self.names), accept=self.accept)
+
+
 def require_fit(misfits: Sequence[str], *, accept: bool = False) -> None:
     """Raise `ContractMismatch` with every misfit; with `accept`, log them as warnings instead."""
     if not misfits:

@@ -11,7 +11,7 @@ import math
 import os
 import time
 from collections import deque
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import Any, Literal, Protocol, get_args
@@ -21,9 +21,11 @@ import numpy as np
 from vlagents_ray.chunking.control import Control
 from vlagents_ray.chunking.fallback import Cause, Held
 from vlagents_ray.client.commands import CommandInbox
-from vlagents_ray.contract import Contract
-from vlagents_ray.errors import ConfigError, InvalidAction
-from vlagents_ray.interface import CAPTURED, CAUSE, INTERVENTION, SAFE, SILENT, WANTED, Act, Agent, Obs
+from vlagents_ray.contract import Contract, require_match
+from vlagents_ray.errors import ConfigError, InvalidAction, VLAgentsError
+from vlagents_ray.interface import CAPTURED, CAUSE, INTERVENTION, PLANNED, SAFE, SILENT, WANTED, Act, Agent, Obs
+from vlagents_ray.robot.fit import Fit, Trained
+from vlagents_ray.robot.limits import Limits
 from vlagents_ray.robot.pacing import KEPT_TICKS, Pacer, jitter, undisturbed
 from vlagents_ray.robot.record import Recorder
 from vlagents_ray.robot.safety import Guard, Watchdog
@@ -72,6 +74,31 @@ def contract_of(robot: Robot) -> Contract:
     """Return what a robot states of itself, with the names of its joints; empty if it states nothing."""
     stated, names = getattr(robot, "contract", None) or Contract(), tuple(getattr(robot, "joint_names", ()))
     return replace(stated, action=replace(stated.action, names=stated.action.names or names or None))
+
+
+def fit_of(
+    agent: Agent, robot: Robot, limits: Limits | None = None, *, trained: Trained | None = None, accept: bool = False
+) -> Fit:
+    """Compare a policy's contract with a robot's, and return the comparison of their numbers for the first motion.
+
+    Args:
+        agent: The policy, after `initialize`.
+        robot: The robot.
+        limits: The limits of the robot.
+        trained: The ranges of the policy's training; default: those of `agent.statistics`. A simulated robot without a
+            contract is not compared with them, as it follows numbers of any unit.
+        accept: Whether numbers that do not fit are only logged.
+
+    Raises:
+        ContractMismatch: The contracts differ.
+    """
+    require_match(agent.contract, contract_of(robot))
+    has_units = not getattr(robot, "simulated", False) or getattr(robot, "contract", None) is not None
+    if trained is None:
+        trained = Trained.from_statistics(agent.statistics or {}) if has_units else Trained()
+    contract = agent.contract or Contract()
+    parts = (*(contract.state or {}), *(["gripper"] if contract.gripper else []))
+    return Fit(trained, limits, tuple(getattr(robot, "joint_names", ())), parts, accept)
 
 
 def robot_watchdog(robot: Robot, stop: Callable[[str], None], silent_s: dict[str, float]) -> Watchdog:
@@ -126,6 +153,21 @@ def robot_named(option: str, name: str, settings: Iterable[str] = ()) -> Callabl
     adapter, _, first = name.partition(":")
     first_argument = (first,) if adapter in _ADAPTERS else ()
     return partial(import_class(option, _ADAPTERS.get(adapter, name), ROBOT), *first_argument, **given)
+
+
+@contextlib.contextmanager
+def opened(make: Callable[[], Robot]) -> Iterator[Robot]:
+    """Yield a new robot, which is closed at the end if it has `close`; raises `ConfigError` if it cannot be made."""
+    try:
+        robot = make()
+    except VLAgentsError:
+        raise
+    except Exception as error:
+        raise ConfigError(f"robot: {type(error).__name__}: {error}; it could not be made, see the log") from error
+    try:
+        yield robot
+    finally:
+        getattr(robot, "close", lambda: None)()
 
 
 @dataclass(slots=True)
@@ -193,6 +235,7 @@ def run_loop(
     real_time: bool = False,
     until: Callable[[], bool] = lambda: False,
     commands: CommandInbox | None = None,
+    fit: Fit | None = None,
 ) -> LoopReport:
     """Reset an agent and let it drive a robot at a fixed rate, until it is done or the time is over.
 
@@ -228,6 +271,7 @@ def run_loop(
         until: Ends the loop when it returns True; called before each tick, and after the last one. This is not a stop:
             with a rest pose the robot goes there. Use `Watchdog.trip` or `Control.stop` for a stop.
         commands: The commands of the live page, from `RemoteAgent(url, commands=...)`: pause, stop, mark.
+        fit: The comparison of policy and robot, for misfits that are accepted; default: `fit_of(agent, robot, limits)`.
 
     Returns:
         The timing of the loop, and the reasons of the ticks without an action of the policy.
@@ -235,6 +279,7 @@ def run_loop(
     Raises:
         ConfigError: `hz`, `seconds` or `restart` has a wrong value, `guard` differs from the agent's own or has limits
             for another rate, or the recorder has no columns for interventions.
+        ContractMismatch: Before the first motion of the policy: it does not fit the robot.
         InvalidAction: An action is a chunk, or the guard refuses it.
     """
     if restart is None:
@@ -265,11 +310,14 @@ def run_loop(
     guard = guard or own or Guard(agent.contract)
     if guard.hz not in (None, hz):
         raise ConfigError(f"guard: got limits for {guard.hz} Hz in a loop of {hz} Hz, want the same rate")
-    run = _Run(robot, agent, control, guard, watchdog, recorder, commands, LoopView(viewer), report)
+    fit = fit or fit_of(agent, robot, guard.limits)
+    run = _Run(robot, agent, control, guard, watchdog, recorder, commands, LoopView(viewer), report, fit)
     with contextlib.ExitStack() as stack:
         control.begin(auto=restart == "auto")
         try:
-            agent.reset(_observed(robot), instruction, **(reset_options or {}))
+            obs = _observed(robot)
+            fit.require(obs, None)
+            agent.reset(obs, instruction, **(reset_options or {}))
             if recorder is not None:
                 stack.enter_context(recorder.episode(instruction or ""))
             stack.enter_context(run.view.episode(instruction or ""))
@@ -304,6 +352,7 @@ class _Run:
     commands: CommandInbox | None
     view: LoopView
     report: LoopReport
+    fit: Fit | None  # None after the policy's first action
     standing: bool = True  # before the first action, and after a stop until the next one
     last: np.ndarray | None = None  # the last action that was applied, (D,)
 
@@ -402,6 +451,9 @@ class _Run:
             self.report.count(safe)
             if self.standing:
                 return None
+        if self.fit is not None and safe is None and not act.info.get(INTERVENTION):
+            self.fit.require(None, act.info.get(PLANNED, action[np.newaxis]))
+            self.fit = None
         if self.agent.check is not self.guard:  # else it was checked before `act` returned
             action = self.guard(action, self.guard.reference(obs, self.last) if self.standing else self.last)
         self.standing, self.last = False, action

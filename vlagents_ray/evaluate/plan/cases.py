@@ -63,7 +63,8 @@ class EvalCase:
         pushed, robot = self.policy.pushed_weights, {}
         if self.robot is not None:
             settings, task = self.on_robot
-            robot = {"robot": settings.model_dump(exclude={"tasks", "key"}) | {"task": task.model_dump()}}
+            stated = settings.model_dump(exclude={"tasks", "key", "accept_misfit"})
+            robot = {"robot": stated | {"task": task.model_dump()}}
         return robot | {
             "pushed_weights": None if pushed is None else pushed.model_dump(),
             "env": self.env,

@@ -233,6 +233,7 @@ class RobotConfig(_PlanModel):
     max_step: Annotated[float, Field(gt=0, le=1e6)] | None = None
     measure: str | None = None  # the part of the state that is the measured pose
     limits: str | None = None  # a file of `Limits.read`, without the soft start
+    accept_misfit: bool = False  # play although the training's statistics do not fit the arm; the log shows it
     silent_s: Seconds = 2.0  # a server that is silent for longer ends the trial, which is repeated
 
 

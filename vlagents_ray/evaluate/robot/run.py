@@ -23,7 +23,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from vlagents_ray.errors import ConfigError, VLAgentsError, from_code
+from vlagents_ray.errors import ConfigError, ContractMismatch, VLAgentsError, from_code
 from vlagents_ray.evaluate.artifacts.storage import driver_code, save_diffs, storing, versions
 from vlagents_ray.evaluate.episode.failures import Failure, explain
 from vlagents_ray.evaluate.episode.records import EnvInfo, EpisodeResult
@@ -40,7 +40,7 @@ from vlagents_ray.evaluate.robot.trial import PlayedTrial, Trial, WatchedRobot, 
 from vlagents_ray.evaluate.run import conclude
 from vlagents_ray.evaluate.workers.rollout import AgentFactory, agents
 from vlagents_ray.registry import require
-from vlagents_ray.robot.loop import Robot, robot_named
+from vlagents_ray.robot.loop import Robot, opened, robot_named
 
 LOG, KEY = "trials.jsonl", "trials.key"
 _NONCE = 16  # bytes
@@ -244,12 +244,12 @@ def evaluate_on_robot(
         for module in ("av", "pyarrow"):
             require(module)
     factory = agent_factory or agents(config, None, "robot")
-    if robot is None:
-        robot = robot_named("--robot", str(planned[0].on_robot[0].arm))()
-    watched = WatchedRobot(robot)
-    with TrialLog(config, planned) as log:
+    with contextlib.ExitStack() as stack:
+        if robot is None:
+            robot = stack.enter_context(opened(robot_named("--robot", str(planned[0].on_robot[0].arm))))
+        log = stack.enter_context(TrialLog(config, planned))
         trials = schedule(planned, log.key)
-        run = _RemainingTrials(config, operator, watched, factory, log, trials)
+        run = _RemainingTrials(config, operator, WatchedRobot(robot), factory, log, trials)
         try:
             with _quiet():
                 run.play()
@@ -327,6 +327,12 @@ class _RemainingTrials:
         for _, cell in sorted(policies.items(), key=lambda one: one[0]):  # an order that reveals nothing
             try:
                 rehearse(cell, self._robot, self._factory, self._operator, obs)
+            except ContractMismatch as error:
+                raise ContractMismatch(
+                    f"a policy of this plan does not fit the robot. It is not named here, as the trials are blind; "
+                    f"`vlagents-ray robot URL --robot {cell.on_robot[0].arm}` compares one policy with the robot, "
+                    f"before any motion.\n{error}"
+                ) from None
             except VLAgentsError as error:
                 raise from_code(error.code, f"policy {cell.contender!r}: {error}") from error
         for trial in left:

@@ -27,7 +27,9 @@ from vlagents_ray.evaluate.workers.rollout import AgentFactory
 from vlagents_ray.interface import Act, Agent, Obs
 from vlagents_ray.naming import plain
 from vlagents_ray.robot import Guard, LoopReport, run_loop
-from vlagents_ray.robot.loop import robot_watchdog
+from vlagents_ray.robot.fit import Trained
+from vlagents_ray.robot.limits import Limits
+from vlagents_ray.robot.loop import fit_of, robot_watchdog
 from vlagents_ray.robot.record import Recorder
 from vlagents_ray.robot.safety import measured_state
 from vlagents_ray.robot.wrapper import RobotWrapper
@@ -214,6 +216,8 @@ def play(
                 recorder=recorder,
                 until=until,
                 commands=_OperatorStop(operator),
+                # The rehearsal has compared the numbers; what the policy does in a trial is its result.
+                fit=fit_of(player, robot, trained=Trained()),
             )
         except CheckpointFailed:
             raise
@@ -239,13 +243,20 @@ def play(
 def rehearse(cell: EvalCase, robot: WatchedRobot, factory: AgentFactory, operator: Operator, obs: Obs) -> None:
     """Run a policy once, without moving the robot.
 
-    A mistake in the settings shows before the first trial. Work done on the first call, such as compilation, does not
-    slow the first trial, which would reveal which policy is running.
+    A mistake in the settings, or a policy that does not fit the robot, shows before the first trial. Work done on the
+    first call, such as compilation, does not slow the first trial, which would reveal which policy is running.
     """
-    _, task = cell.on_robot
+    settings, task = cell.on_robot
     unused = EpisodeStats(EpisodeKey(cell.env, 0, 0, cell.fingerprint))
-    with _player(cell, factory, unused, robot, operator) as (_, player):
+    with _player(cell, factory, unused, robot, operator) as (agent, player):
         player.initialize()
+        limits = None if settings.limits is None else Limits.read(settings.limits)
+        fit = fit_of(agent, robot, limits, accept=settings.accept_misfit)
+        fit.require(obs, None)
+        if fit.trained.action is not None:
+            with contextlib.suppress(InvalidAction):
+                agent.reset(obs, task.instruction, **cell.policy_options)
+                fit.require(None, agent.act(obs).rows())
         with contextlib.suppress(InvalidAction):  # in a trial it is a failure of the policy
             player.reset(obs, task.instruction, **cell.policy_options)
             player.act(obs)
