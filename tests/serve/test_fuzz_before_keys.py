@@ -228,13 +228,17 @@ _OF_THREAD = threading.local()
 
 
 def over_zmq(replica: KeyedReplica, _choose: random.Random, segments: Sequence) -> str:
-    """One message, in as many parts as there are segments, all of one client."""
-    if not hasattr(_OF_THREAD, "socket"):
+    """One message, in as many parts as there are segments; a connection is closed after 64 without a key."""
+    if not hasattr(_OF_THREAD, "context"):
         _OF_THREAD.context = zmq.Context()
+    if (_OF_THREAD.__dict__.setdefault("sent", 0)) % 50 == 0:
+        if hasattr(_OF_THREAD, "socket"):
+            _OF_THREAD.socket.close()
         _OF_THREAD.socket = _OF_THREAD.context.socket(zmq.DEALER)
         _OF_THREAD.socket.setsockopt(zmq.LINGER, 0)
         _OF_THREAD.socket.setsockopt(zmq.RCVTIMEO, int(ANSWER_S * 1e3))
         _OF_THREAD.socket.connect(f"tcp://127.0.0.1:{replica.gr00t[False]}")
+    _OF_THREAD.sent += 1
     _OF_THREAD.socket.send_multipart([b"", b"".join(segments)])
     answer = msgpack.unpackb(_OF_THREAD.socket.recv_multipart()[-1], strict_map_key=False)
     return str(answer.get("error", "done")).partition(":")[0]
@@ -274,7 +278,7 @@ def attack(target: Target, replica: KeyedReplica, number: int, seed: int) -> Non
         assert WAYS[target.way](visitor, "with") == "done", target.name
     if hasattr(_OF_THREAD, "socket"):
         _OF_THREAD.context.destroy()
-        del _OF_THREAD.socket
+        _OF_THREAD.__dict__.clear()
 
 
 def held() -> tuple[int, int, int]:

@@ -744,13 +744,13 @@ def test_parts_of_messages_before_a_key_are_bounded_at_groots_gateway(monkeypatc
 def test_requests_that_wait_at_groots_gateway_count_as_in_flight() -> None:
     admission = Admission(3 * 10**6)
     context = GatewayContext("app", _no_replica, DEFAULT_LIMITS, 8, 30.0, None, NoKey.OPEN, admission)
-    answers: queue.SimpleQueue[bytes] = queue.SimpleQueue()
+    answers: queue.SimpleQueue[tuple[gr00t.Envelope, bytes]] = queue.SimpleQueue()
     dialect = gr00t.GR00TDialect("gr00t", gr00t.GR00TDialectConfig(), context)
-    client = gr00t.GR00TConnection(context, dialect.mapping, answers.put)
+    client = gr00t.GR00TConnection(context, dialect.mapping, lambda *answer: answers.put(answer))
     with pytest.raises((Overloaded, MessageTooLarge)):
-        client.put(bytes(4 * 10**6))
-    assert client.put(bytes(10**6))
-    answers.get(timeout=10)
+        client.put((b"id",), bytes(4 * 10**6))
+    assert client.put((b"id",), bytes(10**6))
+    assert answers.get(timeout=10)[0] == (b"id",)
     assert admission.held == 0
     client.end()
     client.thread.join(10)

@@ -13,13 +13,12 @@ import threading
 import time
 from collections.abc import Callable, Iterable
 from dataclasses import replace
-from functools import partial
 from typing import Any
 
 from pydantic import Field
 
 from vlagents_ray.contract import Contract
-from vlagents_ray.errors import PolicyUnavailable, VLAgentsError
+from vlagents_ray.errors import MalformedMessage, VLAgentsError
 from vlagents_ray.registry import require
 from vlagents_ray.serve.access.api_keys import NoKey
 from vlagents_ray.serve.config.dialects import MappingSetting, PortConfig
@@ -33,14 +32,18 @@ logger = logging.getLogger(__name__)
 
 _FOLDER = re.compile(r"^(video|state|language)\.")
 WAITING = 4  # maximum number of waiting requests of one client; a REQ socket sends one at a time
-Envelope = tuple[bytes, ...]  # sender of a message: the connection's id, and the parts between it and the payload
-_ENVELOPE = 8  # maximum number of parts
+# The parts of a message before its payload: ZeroMQ's identity of the connection, and those that a client adds. A REQ
+# socket adds an empty part, a DEALER socket whatever its program chooses.
+Envelope = tuple[bytes, ...]
+_ENVELOPES: tuple[list[bytes], ...] = ([], [b""])  # the parts that a client may add
+_MOST_PARTS, _MOST_PART_BYTES = 4, 256  # of an envelope that is answered with an error; others are ignored
 _HEARTBEAT_MS = 10_000
 _TICK_MS = 500
 _END_S = 3.0
 _STRANGERS = 64  # maximum number of connections without a valid key
 _STRANGERS_MS = 50  # period at which their bytes are counted
 _STRANGER_S = 30.0  # time within which a connection must send a valid key
+_REFUSALS = 64  # messages without a valid key after which a connection is closed
 _RECEIVED = struct.Struct("<Q")  # `tcpi_bytes_received` in Linux' `struct tcp_info`
 _RECEIVED_AT = 128
 
@@ -48,16 +51,17 @@ _RECEIVED_AT = 128
 class GR00TConnection(GatewayClient):
     """One client's requests, which are processed one after the other on a separate thread."""
 
-    def __init__(self, context: GatewayContext, mapping: KeyMapping, answer: Callable[[bytes], None]) -> None:
+    def __init__(self, context: GatewayContext, mapping: KeyMapping, answer: Callable[[Envelope, bytes], None]) -> None:
+        """Start the client's thread, which calls `answer` with the envelope of a request and the answer to it."""
         super().__init__(context)
         self._mapping, self._flat = nested_mapping(mapping)  # flat: whether the client's last keys were N1.5's
         self._send = answer
-        self._requests: queue.SimpleQueue[bytes | None] = queue.SimpleQueue()
+        self._requests: queue.SimpleQueue[tuple[Envelope, bytes] | None] = queue.SimpleQueue()
         self._lock = threading.Lock()
         self.thread = threading.Thread(target=self._run, name="gr00t-client", daemon=True)
         self.thread.start()
 
-    def put(self, payload: bytes) -> bool:
+    def put(self, envelope: Envelope, payload: bytes) -> bool:
         """Queue a request; return False if too many are waiting.
 
         Raises:
@@ -68,20 +72,21 @@ class GR00TConnection(GatewayClient):
                 return False
             self._context.admission.hold(len(payload), True, 0)
             self._unanswered += 1
-        self._requests.put(payload)
+        self._requests.put((envelope, payload))
         return True
 
     def end(self) -> None:
         self._requests.put(None)
 
     def _run(self) -> None:
-        while (payload := self._requests.get()) is not None:
+        while (request := self._requests.get()) is not None:
+            envelope, payload = request
             message = self._answer(payload)
             self._context.admission.release(len(payload))
             with self._lock:
                 self._unanswered -= 1
                 self._used = time.monotonic()
-            self._send(message)
+            self._send(envelope, message)
             time.sleep(self.sessions.throttled_s())
         self.sessions.close()
 
@@ -183,7 +188,7 @@ class GR00TDialect(PortDialect):
 
     def __init__(self, name: str, config: GR00TDialectConfig, context: GatewayContext) -> None:
         super().__init__(name, config, context)
-        self._clients: GatewayClients[Envelope, GR00TConnection] = GatewayClients(context)
+        self._clients: GatewayClients[bytes, GR00TConnection] = GatewayClients(context)  # by identity
         self._looked = float("-inf")  # time of the last check of all clients, s
         self._answers: queue.SimpleQueue[tuple[Envelope, bytes]] = queue.SimpleQueue()
         self._bell, self._ring = socket.socketpair()
@@ -288,26 +293,50 @@ class GR00TDialect(PortDialect):
             except zmq.ZMQError as error:
                 logger.info("gr00t: a message was lost: %s", error)
                 return
-            if not 2 <= len(parts) <= _ENVELOPE:
+            *envelope_parts, payload = parts
+            descriptor: int = payload.get(zmq.SRCFD)
+            sizes = [len(part) for part in envelope_parts]
+            if not 0 < len(sizes) <= _MOST_PARTS or sum(sizes) > _MOST_PART_BYTES:
+                self._refuse(descriptor)
                 continue
-            *envelope, payload = (part.bytes for part in parts)
-            self._take(tuple(envelope), payload, parts[-1].get(zmq.SRCFD))
-
-    def _take(self, envelope: Envelope, payload: bytes, descriptor: int) -> None:
-        if (client := self._clients.get(envelope)) is None:
-            answer = partial(self.answer, envelope)
+            envelope = tuple(part.bytes for part in envelope_parts)
             try:
-                client = self._clients.add(envelope, lambda: GR00TConnection(self.context, self.mapping, answer))
-            except PolicyUnavailable as full:
-                answer(gr00t.pack({"error": f"{full.code}: {full}"}))
-                return
+                self._take(envelope, payload, descriptor)
+            except VLAgentsError as error:
+                self.answer(envelope, gr00t.pack({"error": f"{error.code}: {error}"}))
+
+    def _take(self, envelope: Envelope, payload: Any, descriptor: int) -> None:
+        """Pass a message to its client, which is created once a message of its connection has a valid key."""
+        identity, *added = envelope
+        if added not in _ENVELOPES:
+            self._refuse(descriptor)
+            raise MalformedMessage(
+                f"gr00t: got an envelope of {len(added)} parts, want none or an empty one; connect each client "
+                f"directly, without a ZeroMQ proxy"
+            )
+        client = self._clients.get(identity)
+        if client is None or (self._strangers is not None and self._strangers.includes(descriptor)):
+            self._require_key(payload.buffer, descriptor)
+        if client is None:
+            client = self._clients.add(identity, lambda: GR00TConnection(self.context, self.mapping, self.answer))
+        if not client.put(envelope, payload.bytes):
+            raise MalformedMessage("wait for the answer before the next request")
+
+    def _require_key(self, payload: memoryview, descriptor: int) -> None:
+        """Raise an error unless a message has a valid key, or needs none; its connection is then no stranger."""
+        check = self.context.check
+        if not isinstance(check, NoKey):
+            try:
+                check(gr00t.read_token(payload, self.context.limits))
+            except VLAgentsError:
+                self._refuse(descriptor)
+                raise
         if self._strangers is not None:
-            self._strangers.note_client(descriptor, client)
-        try:
-            if not client.put(payload):
-                self.answer(envelope, gr00t.pack({"error": "malformed: wait for the answer before the next request"}))
-        except VLAgentsError as error:
-            self.answer(envelope, gr00t.pack({"error": f"{error.code}: {error}"}))
+            self._strangers.admit(descriptor)
+
+    def _refuse(self, descriptor: int) -> None:
+        if self._strangers is not None:
+            self._strangers.refuse(descriptor)
 
 
 class _Strangers:
@@ -323,7 +352,7 @@ class _Strangers:
         self._router, self._zmq = router, zmq
         self._port, self._most_bytes = port, most_bytes
         self._since: dict[int, tuple[socket.socket, float]] = {}  # by the descriptor in ZeroMQ, oldest first
-        self._clients: dict[int, GR00TConnection] = {}
+        self._refused: dict[int, int] = {}  # number of refused messages, by descriptor
 
     def __len__(self) -> int:
         return len(self._since)
@@ -337,15 +366,24 @@ class _Strangers:
             if event["event"] == self._zmq.EVENT_ACCEPTED:
                 self._add(event["value"])
 
-    def note_client(self, descriptor: int, client: GR00TConnection) -> None:
-        """Record the client of a connection's message; its key is checked on another thread."""
-        if descriptor in self._since:
-            self._clients[descriptor] = client
+    def includes(self, descriptor: int) -> bool:
+        """Return whether no message of a connection has had a valid key, or a later one had none."""
+        return descriptor in self._since
+
+    def admit(self, descriptor: int) -> None:
+        """Drop a connection: one of its messages has a valid key."""
+        self._drop(descriptor)
+
+    def refuse(self, descriptor: int) -> None:
+        """Count a refused message of a connection, and close the connection after too many."""
+        if descriptor not in self._since:
+            self._add(descriptor)
+        self._refused[descriptor] = self._refused.get(descriptor, 0) + 1
+        if self._refused[descriptor] >= _REFUSALS and descriptor in self._since:
+            self._end(descriptor, f"{_REFUSALS} messages without a valid key")
 
     def end_overdue(self) -> None:
-        """End connections that take too long, and the largest while all are too large; drop those with a valid key."""
-        for descriptor in [one for one, client in self._clients.items() if client.sessions.known]:
-            self._drop(descriptor)
+        """End connections that take too long, and the largest while all are too large."""
         late = time.monotonic() - _STRANGER_S
         sizes = {one: _received(connection) for one, (connection, _) in self._since.items()}
         for descriptor, (_, since) in list(self._since.items()):
@@ -381,7 +419,7 @@ class _Strangers:
         self._drop(descriptor)
 
     def _drop(self, descriptor: int) -> None:
-        self._clients.pop(descriptor, None)
+        self._refused.pop(descriptor, None)
         if (known := self._since.pop(descriptor, None)) is not None:
             known[0].close()
 
