@@ -27,7 +27,7 @@ from vlagents_ray.naming import did_you_mean
 from vlagents_ray.protocol.messages import DEFAULT_LIMITS, Budget
 from vlagents_ray.protocol.values import from_text
 from vlagents_ray.registry import require
-from vlagents_ray.robot.episode import ACTION, ENVIRONMENT, IMAGES, INTERVENTION_COLUMN, STATE
+from vlagents_ray.robot.episode import ACTION, ENVIRONMENT, IMAGES, INTERVENTION_COLUMN, SAFE_COLUMN, STATE
 from vlagents_ray.serve.config.deployment import ServerArgs
 from vlagents_ray.serve.launch.deployment_file import own_settings, policy_application
 from vlagents_ray.serve.local_agent import LocalPolicy
@@ -53,7 +53,7 @@ class RecordedStep:
     frame: int
     obs: Obs
     expected: np.ndarray  # (H, D): the recorded answer, or the actions from here to the end of the episode
-    intervention: bool = False  # whether an operator moved the robot
+    intervention: bool = False  # whether the recorded action is an operator's
 
 
 @dataclass(frozen=True, slots=True)
@@ -128,7 +128,8 @@ class RecordedDataset:
         pictures = [name for name, one in self.features.items() if one["dtype"] in _PICTURES]
         images = [name for name in pictures if self.features[name]["dtype"] == "image"]
         traced = [CHUNK, ROWS, "request", "captured_at"] if self.traced else []
-        numbers = [name for name in (ACTION, STATE, ENVIRONMENT, INTERVENTION_COLUMN) if name in self.features]
+        columns = (ACTION, STATE, ENVIRONMENT, INTERVENTION_COLUMN, SAFE_COLUMN)
+        numbers = [name for name in columns if name in self.features]
         rows = self._rows(part, [*numbers, *images, *traced])
         actions = np.array(rows[ACTION], np.float32).reshape(part.length, -1)
         cameras = self._cameras(pictures, names)
@@ -158,6 +159,8 @@ class RecordedDataset:
                 info = {CAPTURED: rows["captured_at"][i], **_values(rows["request"][i])}
                 expected = np.array(rows[CHUNK][i], np.float32).reshape(-1, actions.shape[1])[: rows[ROWS][i]]
             led = INTERVENTION_COLUMN in rows and bool(rows[INTERVENTION_COLUMN][i])
+            # Datasets of earlier releases also mark an operator's action that the guard refused.
+            led = led and not (SAFE_COLUMN in rows and rows[SAFE_COLUMN][i])
             yield RecordedStep(i, Obs(shown, gripper, state, info), expected, led)
 
     def _parts(self) -> list[RecordedEpisode]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import json
 import threading
 from pathlib import Path
@@ -15,6 +16,7 @@ from scripted_leader import ScriptedLeader
 
 from vlagents_ray import Act, ActionSpec, Agent, ConfigError, Contract, Obs
 from vlagents_ray.chunking.player import ChunkPlayer, PlayerSettings
+from vlagents_ray.open_loop import Names, RecordedDataset
 from vlagents_ray.robot import Guard, Watchdog, run_loop
 from vlagents_ray.robot.record import Recorder
 from vlagents_ray.robot.simulated import SimulatedRobot
@@ -196,3 +198,41 @@ def test_a_recorder_without_a_place_for_interventions_is_refused_before_anything
     with Recorder(tmp_path, HZ) as recorder, player, pytest.raises(ConfigError, match="interventions=True"):
         run_loop(arm, player, hz=HZ, seconds=1.0, recorder=recorder)
     assert arm.commanded == []
+
+
+@pytest.mark.parametrize("mode", ["open_loop", "async"])
+@pytest.mark.parametrize("relative", [False, True])
+def test_a_recorded_frame_is_the_policys_or_an_operators_or_a_safe_one(
+    tmp_path: Path, mode: Any, *, relative: bool
+) -> None:
+    """The operator's action is within the bounds, beyond them, or missing, one after the other."""
+
+    class Still(Agent):
+        contract = Contract(action=ActionSpec(dim=2, delta=relative))
+
+        def act(self, obs: Obs) -> Act:
+            return Act(np.zeros((8, 2), np.float32))
+
+    arm, ticks = Arm(), itertools.count()
+
+    def led(obs: Obs) -> np.ndarray:
+        tick = next(ticks)
+        if tick % 3 == 2:
+            raise RuntimeError("the device is unplugged")
+        return np.full(2, 0.1 if tick % 3 == 0 else 3.0, np.float32)
+
+    leader = ScriptedLeader(led, lambda: 5 <= leader.polls < 35)
+    guard = Guard(Still.contract, low=-1.0, high=1.0)
+    player = ChunkPlayer(Still(), PlayerSettings(mode, deadline_s=0.5), override=leader, check=guard)
+    with player, Recorder(tmp_path, 200, interventions=True) as recorder:
+        report = run_loop(arm, player, hz=200.0, recorder=recorder, until=lambda: leader.polls > 45)
+    seen = rows(tmp_path)
+    pairs = list(zip(seen["intervention"], seen["safe"], seen["action"], strict=True))
+    operators = [action for intervention, _, action in pairs if intervention]
+    assert not any(intervention and safe for intervention, safe, _ in pairs)
+    assert operators == [pytest.approx([0.1, 0.1])] * 10
+    assert report.interventions == 10
+    assert sum(safe for _, safe, _ in pairs) >= 20
+    [play] = RecordedDataset(tmp_path).plays()
+    steps = list(RecordedDataset(tmp_path).steps(play.parts[0], Names(), None))
+    assert sum(step.intervention for step in steps) == 10, "those that training imitates"

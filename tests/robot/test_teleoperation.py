@@ -7,6 +7,7 @@ import pty
 import sys
 import termios
 from collections.abc import Iterator
+from dataclasses import replace
 from types import ModuleType, SimpleNamespace
 from typing import Any
 
@@ -14,11 +15,11 @@ import numpy as np
 import pytest
 from eval_fakes import Clock
 
-from vlagents_ray import ActionSpec, ConfigError, Contract, Obs
+from vlagents_ray import Act, ActionSpec, Agent, ChunkPlayer, ConfigError, Contract, Obs, PlayerSettings
 from vlagents_ray.envs import make_env
 from vlagents_ray.errors import MissingDependency, MissingState
 from vlagents_ray.policies.noop import Noop, NoopConfig
-from vlagents_ray.robot import run_loop
+from vlagents_ray.robot import Guard, Limits, run_loop
 from vlagents_ray.robot.simulated import EnvRobot
 from vlagents_ray.robot.teleoperation import AxesLeader, Keyboard, SpaceMouse, TeleoperatedAgent
 
@@ -159,6 +160,66 @@ def test_absolute_targets_begin_where_the_robot_stands_and_stay_within_the_bound
     AxesLeader(Noop(NoopConfig(delta=False)).contract, stick, step=0.1)
     measured = AxesLeader(JOINTS, stick, step=0.1, measure=lambda _: np.array([-0.5, 0, 0]))
     assert measured.action(Obs()) == pytest.approx([-0.6, 0.1, 0])
+
+
+class Obedient:
+    """An arm that is where it was commanded to be, and may hold."""
+
+    def __init__(self) -> None:
+        self.joints = np.zeros(3, np.float32)
+        self.holds: str | None = None
+        self.path: list[float] = []
+
+    def observe(self) -> Obs:
+        self.path.append(float(self.joints[0]))
+        return Obs(state={"joints": self.joints.copy()})
+
+    def apply(self, action: np.ndarray) -> None:
+        self.joints = action.copy()
+
+    def stop(self) -> None: ...
+
+
+class Idle(Agent):
+    contract = JOINTS
+
+    def act(self, obs: Obs) -> Act:
+        return Act(np.zeros((4, 3), np.float32))
+
+
+FORWARDS, TICKS, STEP = 60, 100, 0.01
+REFUSALS = {
+    "a bound": Guard(JOINTS, high=0.2),
+    "a bound of a file": Guard(JOINTS, limits=Limits(high=(0.2, 9.0, 9.0)), hz=200.0),
+    "a measured pose": Guard(JOINTS, high=0.2, max_step=0.05, measure=lambda obs: obs.state["joints"]),
+    "the contract": Guard(Contract(action=replace(JOINTS.action, high=0.2))),
+    "a robot that holds": Guard(JOINTS),
+    "a check of one's own": Guard(JOINTS, high=0.2, max_step=0.011),
+}
+
+
+@pytest.mark.parametrize("measured", [False, True])
+@pytest.mark.parametrize("refusal", REFUSALS)
+def test_an_operators_target_does_not_run_on_while_the_arm_does_not_follow(refusal: str, *, measured: bool) -> None:
+    stick, arm = Stick(), Obedient()
+    stick.at[0] = 1.0
+
+    def over() -> bool:
+        tick = len(arm.path)
+        stick.at[0] = 1.0 if tick < FORWARDS else -1.0
+        arm.holds = "the camera hangs" if refusal == "a robot that holds" and 20 <= tick < FORWARDS else None
+        return tick >= TICKS
+
+    measure = (lambda obs: obs.state["joints"]) if measured else None
+    leader = AxesLeader(JOINTS, stick, step=STEP, measure=measure)
+    player = ChunkPlayer(Idle(), PlayerSettings("async"), check=REFUSALS[refusal], override=leader)
+    with player:
+        run_loop(arm, player, hz=200.0, until=over)
+    at_turn = arm.path[FORWARDS - 1]
+    assert at_turn == pytest.approx(0.2, abs=2 * STEP), "it stood against the bound, or held"
+    moved = [number for number, place in enumerate(arm.path[FORWARDS:]) if place < at_turn - STEP / 2]
+    assert moved[0] <= 3, "ticks of the way back without motion"
+    assert arm.path[-1] < at_turn - 0.8 * STEP * (TICKS - FORWARDS - 5), "it obeys each tick of the way back"
 
 
 class Mouse:

@@ -18,7 +18,12 @@ PAUSED = "paused by an operator"
 
 
 class Leader(Protocol):
-    """The interface of an operator's device: a keyboard, a SpaceMouse, a second arm."""
+    """The interface of an operator's device: a keyboard, a SpaceMouse, a second arm.
+
+    A device that adds up its motions to absolute targets also has a method `rebase(last)`, which is called when its
+    action was not executed. The next target then begins at `last`, the executed command, (D,) float32, or at the
+    robot's measured pose if `last` is None. Else targets would run on while the guard refuses them.
+    """
 
     def engaged(self) -> bool:
         """Return whether the operator moves the robot at this tick; must not block."""

@@ -275,6 +275,7 @@ class ChunkPlayer(Agent):
             self._in_place.pop()
             self._noted = False
         self._motion.stop()
+        self._rebase_leader(None)
 
     def observe(self, obs: Obs, action: np.ndarray | None = None) -> None:
         """Pass an observation to the policy without requesting an action.
@@ -436,8 +437,16 @@ class ChunkPlayer(Agent):
             action = self._motion.move(action, obs)
         except InvalidAction as error:
             action, held = self._motion.hold(obs, refused(error))
+            del info[INTERVENTION]  # the safe action is not the operator's
             info |= {SAFE: held.reason, CAUSE: held.cause}
+            self._rebase_leader(action)
         return Act(action.copy(), info=info)
+
+    def _rebase_leader(self, last: np.ndarray | None) -> None:
+        """Report to the operator's device that its action was not executed (see `Leader`)."""
+        rebase = getattr(self.control.leader, "rebase", None)
+        if rebase is not None:
+            rebase(last)
 
     def _chosen(self, obs: Obs, tick: int) -> Act:
         held = self.control.held

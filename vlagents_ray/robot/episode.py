@@ -20,10 +20,11 @@ from vlagents_ray.naming import distinct
 
 IMAGES, STATE, ACTION = "observation.images.", "observation.state", "action"
 ENVIRONMENT = "observation.environment_state"
+SAFE_COLUMN = "safe"
 MOMENTS = {  # further columns of each recorded frame
     "captured_at": "float64",  # s since 1970
     "tick": "int64",  # of the control loop; gaps are missed or dropped frames
-    "safe": "bool",  # whether the action is a safe one, not the policy's
+    SAFE_COLUMN: "bool",  # whether the action is a safe one, not the policy's
 }
 WANTED_ACTION, INTERVENTION_COLUMN = "policy_action", "intervention"
 INTERVENTIONS = {  # further columns of a recording with interventions, beside `WANTED_ACTION`, (D,) float32
@@ -110,7 +111,7 @@ class RobotEpisode:
             ACTION: np.asarray(action, np.float32),
             "captured_at": captured_at,
             "tick": tick,
-            "safe": safe,
+            SAFE_COLUMN: safe,
             **more,
         }
         if len(values):

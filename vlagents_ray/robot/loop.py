@@ -394,7 +394,7 @@ class _Run:
                     self.view.add(obs, act, None, tick, pacer.since_tick_s(), stop.reason)
                 elif (action := self._applied(obs, act)) is not None:
                     work_s.append(pacer.since_tick_s())
-                    led = bool(act.info.get(INTERVENTION))
+                    led = INTERVENTION in act.info and SAFE not in act.info
                     self.report.interventions += led
                     if self.recorder is not None:
                         wanted = act.info.get(WANTED)

@@ -100,6 +100,10 @@ class AxesLeader:
         self._engaged = engaged
         return engaged
 
+    def rebase(self, last: np.ndarray | None) -> None:
+        """Begin the next absolute target at the last command, (D,), or at the measured pose if `last` is None."""
+        self._target = None if last is None else np.array(last, np.float32)
+
     def action(self, obs: Obs) -> np.ndarray:
         """Return the action of the axes as read last, (D,) float32."""
         spec, axes = self._spec, self._device.axes()
@@ -279,6 +283,12 @@ class TeleoperatedAgent(Agent):
         """Return the operator's action, (D,) float32, with `info["intervention"]`."""
         self._leader.engaged()  # reads the device
         return Act(self._leader.action(obs), info={INTERVENTION: True})
+
+    def interrupt(self) -> None:
+        """Let absolute targets begin at the measured pose again, as the robot was stopped."""
+        rebase = getattr(self._leader, "rebase", None)
+        if rebase is not None:
+            rebase(None)
 
 
 # The only reader of the terminal, so that each typed key has exactly one consumer.
