@@ -12,25 +12,38 @@ _UNCERTAIN = ("silence", "outcome_unknown", "connection_lost")
 _NOT_DONE = ("deadline_exceeded", "unavailable")
 
 
+PATIENCE_S = 4.5  # more than a request, and some messages between replicas, take on their way
+
+
 class Violation(AssertionError):
     """What must not happen."""
 
 
 class Robot:
-    """One session, for a few episodes. With `steps` it sends back the step of the last answer."""
+    """One session, for a few episodes. With `steps` it sends back the step of the last answer.
+
+    Without `steps` and with `gives_up` it sends no deadline, and begins its next episode when an answer does not come:
+    over HTTP after longer than a message between replicas takes, or over a connection at once, which it closes, to
+    connect again elsewhere. Either way each act belongs to the episode in which it was sent.
+    """
 
     def __init__(self, world: World, number: int) -> None:
         self.world = world
         self.name = f"robot{number}"
         draw = world.draw
         self.steps = draw.random() < 0.6
-        self.timed = draw.random() < 0.5  # over HTTP; else over a connection
+        self.timed = draw.random() < 0.5  # over HTTP; else as over a connection
+        self.gives_up = not self.steps and draw.random() < 0.6
+        self.link = world.connect() if self.gives_up and not self.timed else None
+        # A fault may hold an HTTP request back until later ones have been executed elsewhere.
+        self.strict = self.link is not None or (self.gives_up and not world.plan.rough)
         self.history: list[str] = []
         self.refused: list[str] = []  # acts whose answer says that they were not executed, and never will be
         self.done: list[str] = []  # acts that were answered with an action
         self.over = False
         self.uncertain: set[str] = set()  # acts and resets of which it does not know what became
         self._step: int | None = None
+        self._announced = 0.0  # time at which all replicas have learned of its latest reset
         self._asked = 0
 
     async def run(self) -> None:
@@ -47,18 +60,21 @@ class Robot:
             self._asked += 1
             instruction = f"{instruction}.{self._asked}"
             reply = await self._ask("reset", instruction, None)
+            self._announced = self.world.clock.now + PATIENCE_S
             if code(reply) == "ok":
                 break
             if code(reply) in _UNCERTAIN:
                 self.uncertain.add(instruction)
+            self._reconnect(reply)
             await asyncio.sleep(0.1)
         acted: list[str] = []  # that it was told of
         for _ in range(draw.randint(2, 6)):
-            await asyncio.sleep(draw.random() * 0.4)
+            await asyncio.sleep(draw.random() * (3.0 if self.gives_up else 0.4))
             self._asked += 1
             name = f"{self.name}.{self._asked}"
             reply = await self._ask("act", instruction, name)
             outcome = code(reply)
+            self._reconnect(reply)
             if outcome == "ok" and reply is not None:
                 self.done.append(name)
                 self._check(reply, instruction, [*acted, name])
@@ -67,7 +83,7 @@ class Robot:
                 self.refused.append(name)
             elif outcome in _UNCERTAIN:
                 self.uncertain.add(name)
-                if self.steps:
+                if self.steps or self.gives_up:
                     return  # where it is now is not known: another episode
             else:
                 if not self.world.plan.rough and not self.uncertain:
@@ -76,11 +92,17 @@ class Robot:
                     )
                 return
 
+    def _reconnect(self, reply: Reply | None) -> None:
+        """Elsewhere, if the connection is silent, or its replica stops."""
+        if self.link is not None and (reply is None or reply.draining or code(reply) == "unavailable"):
+            self.link.end()
+            self.link = self.world.connect()
+
     def _check(self, reply: Reply, instruction: str, expected: list[str]) -> None:
         obeyed, ids = reply.act.info["obeys"], reply.act.info["ids"]
         if not obeyed.startswith(self.name + "/"):
             raise Violation(f"{expected[-1]}: crossed with another session, it obeys {obeyed}")
-        if not self.steps and (self.uncertain or self.world.plan.rough):
+        if not (self.steps or self.strict) and (self.uncertain or self.world.plan.rough):
             return  # what it gave up may come late, and what a fault left behind may be met: steps are for that
         if obeyed != instruction:
             raise Violation(f"{expected[-1]}: of an older episode, it obeys {obeyed}, not {instruction}")
@@ -92,19 +114,23 @@ class Robot:
     async def _ask(self, op: str, instruction: str, name: str | None) -> Reply | None:
         """The answer, if it comes in time."""
         draw = self.world.draw
-        deadline_s = draw.choice([0.05, 0.5, 3.0, None])
+        deadline_s = None if self.gives_up else draw.choice([0.05, 0.5, 3.0, None])
         answer = self.world.send(
             op,  # type: ignore[arg-type]
             self.name,
-            Obs(info={"id": name}),
-            steady=not self.steps,
+            Obs(info={"id": name, "of": instruction if self.strict else None}),
+            link=self.link,
+            steady=not (self.steps or (self.gives_up and self.world.clock.now > self._announced)),
             timed=self.timed,
             instruction=instruction if op == "reset" else None,
             step=self._step if self.steps else None,
             deadline_ms=None if deadline_s is None else deadline_s * 1e3,
             request_id=name or instruction,
         )
-        patience_s = 20.0 if deadline_s is None else deadline_s + draw.choice([0.0, 12.0])
+        if self.gives_up:
+            patience_s = draw.choice([0.05, 0.5, 3.0]) if self.link is not None else PATIENCE_S
+        else:
+            patience_s = 20.0 if deadline_s is None else deadline_s + draw.choice([0.0, 12.0])
         await asyncio.wait([answer], timeout=patience_s)
         reply = answer.result() if answer.done() else None
         if reply is not None and reply.step is not None and reply.error is None:
@@ -124,7 +150,7 @@ def play(world: World) -> list[Robot]:
                 task.result()
         if world.clock.errors:
             raise world.clock.errors[0]
-        names = [name for name, _ in world.log.acts]
+        names = [name for name, _, _ in world.log.acts]
         executed = set(names)
         if len(executed) < len(names):
             raise Violation(f"executed twice: {sorted(name for name in executed if names.count(name) > 1)}")
@@ -133,7 +159,9 @@ def play(world: World) -> list[Robot]:
                 raise Violation(f"executed, though answered with that they never would be: {sorted(late)}")
             if unheard := set(robot.done) - executed:
                 raise Violation(f"answered, but never executed: {sorted(unheard)}")
-        for name, obeyed in world.log.acts:
+        for name, obeyed, sent_in in world.log.acts:
+            if sent_in is not None and sent_in != obeyed:
+                raise Violation(f"{name}: sent in episode {sent_in}, executed in {obeyed}")
             if name.partition(".")[0] != obeyed.partition("/")[0]:
                 raise Violation(f"{name}: crossed with another session, it obeyed {obeyed}")
     finally:

@@ -17,7 +17,7 @@ from in_flight import submit
 
 from tests.simulation.clients import Robot, Violation, play
 from tests.simulation.world import Replica, World
-from vlagents_ray.errors import UnknownSession, VLAgentsError
+from vlagents_ray.errors import PolicyUnavailable, UnknownSession, VLAgentsError
 from vlagents_ray.serve.requests import PendingRequest
 from vlagents_ray.serve.scaling import session_migration
 from vlagents_ray.serve.sessions import Session
@@ -125,9 +125,33 @@ def deadlines_begin_anew(replica: Replica) -> None:
 
         if pending.request.op != "act" or not isinstance(error, UnknownSession) or engine.finder is None:
             return False
-        return engine.finder.fetch(pending.session_id, retry)
+        if not engine.finder.fetch(pending.session_id, retry):
+            pending.fail(PolicyUnavailable("the replica is stopping"))
+        return True
 
     engine._seek = seek  # type: ignore[method-assign]
+
+
+def forget_episodes(replica: Replica) -> None:
+    """An act without a step is for whatever episode its session is in when the policy is free."""
+    replica.engine._episode_of = lambda *_: None  # type: ignore[method-assign,return-value]
+    replica.engine._can_act_on = lambda *_: True  # type: ignore[method-assign]
+
+
+def outlive_connections(replica: Replica) -> None:
+    """The requests of a connection that has ended wait on for the policy."""
+    close_owned = replica.engine.sessions.close_owned
+
+    def forget_the_end(connection: str, session_ids: Any) -> None:
+        for pending in (*replica.engine.queue._waiting.clear(), *replica.engine.queue._running):
+            if pending.origin.owner == connection:
+                pending.origin.ended = False
+            if not pending.begun:
+                replica.engine.queue.put(pending)
+        close_owned(connection, session_ids)
+
+    replica.engine.sessions.close_owned = forget_the_end  # type: ignore[method-assign]
+    forget_episodes(replica)
 
 
 @pytest.mark.parametrize(
@@ -135,15 +159,23 @@ def deadlines_begin_anew(replica: Replica) -> None:
     [
         ({"spoil": overwrite}, "of an older episode|a session was|lost or doubled"),
         ({"spoil": export_at_once}, "a session was"),
-        ({"spoil": deadlines_begin_anew}, "never would be|lost or doubled"),
+        ({"spoil": deadlines_begin_anew}, "never would be|lost or doubled|sent in episode"),
+        ({"spoil": forget_episodes}, "sent in episode"),
+        ({"spoil": outlive_connections}, "sent in episode"),
     ],
-    ids=["older episodes overwrite", "a slow export destroys", "deadlines begin anew"],
+    ids=[
+        "older episodes overwrite",
+        "a slow export destroys",
+        "deadlines begin anew",
+        "acts of any episode",
+        "ended connections act",
+    ],
 )
 def test_the_simulation_finds_what_was_wrong_before(
     world: dict[str, Callable[..., Any]], sign: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(session_migration, "EXPORT_S", 3.0)
-    monkeypatch.setattr(session_migration, "EXPORT_S", 3.0)
+    if world["spoil"] is export_at_once:
+        monkeypatch.setattr(session_migration, "EXPORT_S", 3.0)
     with pytest.raises(Violation, match=sign) as found:
         run_all(2000, **world)
     print(found.value)

@@ -32,10 +32,10 @@ _EPOCH_NS = 1_700_000_000 * 10**9
 
 
 class Log:
-    """What the policy did: the ids of the acts, in order, each with what the session obeyed."""
+    """What the policy did: the ids of the acts, in order, with what the session obeyed, and what the client meant."""
 
     def __init__(self) -> None:
-        self.acts: list[tuple[str, str]] = []
+        self.acts: list[tuple[str, str, str | None]] = []
 
 
 class Remembering(Agent):
@@ -52,7 +52,7 @@ class Remembering(Agent):
 
     def act(self, obs: Obs) -> Act:
         self.ids = (*self.ids, obs.info["id"])
-        self.log.acts.append((obs.info["id"], self.instruction))
+        self.log.acts.append((obs.info["id"], self.instruction, obs.info["of"]))
         return Act(_ACTION, info={"obeys": self.instruction, "ids": self.ids})
 
 
@@ -83,7 +83,7 @@ class Replica:
         self.draining = False
         self.cut_off_until = 0.0
         self._busy = False
-        self.migrator = SessionMigrator(self._others, self.loop, _at_once)
+        self.migrator = SessionMigrator(self.name, self._others, self.loop, _at_once)
         self.engine = Engine(
             Remembering(world.log),
             max_batch_size=4,
@@ -132,6 +132,30 @@ class Replica:
             task.add_done_callback(lambda done: answer(done.result()))
         else:
             send(sender, [request], answer)
+
+
+class Link:
+    """A client's connection to one replica: what is sent arrives in order, and last that it has ended."""
+
+    def __init__(self, world: World, replica: Replica) -> None:
+        self.replica = replica
+        self._world = world
+        self._sender = Sender(replica.engine, "websocket", caller=NoKey.OPEN)
+        self._latest = 0.0  # time at which the last message arrives
+
+    def carry(self, deliver: Callable[[], None]) -> None:
+        """To the replica, if it still lives."""
+        self._latest = max(self._latest + 1e-6, self._world.arrival(None, self.replica))
+        loop = self.replica.loop if self.replica.alive else self._world.outside
+        loop.call_at(self._latest, lambda: deliver() if self.replica.alive else None)
+
+    def send(self, request: Request, answer: Callable[[list[Reply]], None]) -> None:
+        """A request of one of its sessions."""
+        self.carry(lambda: send(self._sender, [request], answer) and None)
+
+    def end(self) -> None:
+        """Close it."""
+        self.carry(self._sender.release)
 
 
 class _Peer(Peer):
@@ -213,11 +237,21 @@ class World:
         """Carry a message. What leaves a replica that is cut off, or is for one, waits until it is not."""
         if source is not None and not source.alive:
             return
+        when = self.arrival(source, target)
+        (self.outside if target is None or not target.alive else target.loop).call_at(when, deliver)
+
+    def connect(self) -> Link:
+        """A client's connection to any replica that accepts one."""
+        ready = [replica for replica in self.replicas if replica.alive and not replica.draining] or self.replicas
+        return Link(self, self.draw.choice(ready))
+
+    def arrival(self, source: Replica | None, target: Replica | None) -> float:
+        """When a message arrives that is sent now."""
         when = self.clock.now + self.delay_s()
         for end in (source, target):
             if end is not None and end.cut_off_until > when:
                 when = end.cut_off_until + self.delay_s()
-        (self.outside if target is None or not target.alive else target.loop).call_at(when, deliver)
+        return when
 
     def watch(self, other: Replica, me: Replica, answer: asyncio.Future[Any]) -> None:
         """The caller hears of a replica's end a moment later, even if that had its message."""
@@ -267,11 +301,11 @@ class World:
         replica.loop.create_task(stop())
 
     def send(
-        self, op: Op, session_id: str, obs: Obs, *, steady: bool, timed: bool, **fields: Any
+        self, op: Op, session_id: str, obs: Obs, *, link: Link | None, steady: bool, timed: bool, **fields: Any
     ) -> asyncio.Future[Reply]:
         """A client's request; its answer may never come."""
         answer: asyncio.Future[Reply] = self.outside.create_future()
-        replica = self.route(session_id, steady)
+        replica = self.route(session_id, steady) if link is None else link.replica
 
         def answered(replies: list[Reply]) -> None:
             self.transport(replica, None, partial(_settle, answer, replies[0]))
@@ -280,7 +314,10 @@ class World:
             if replica.alive:
                 replica.receive(Request(op, obs, **fields), session_id, answered, timed)
 
-        self.transport(None, replica, deliver)
+        if link is None:
+            self.transport(None, replica, deliver)
+        else:
+            link.send(Request(op, obs, session=session_id, **fields), answered)
         return answer
 
     def close(self) -> None:

@@ -50,7 +50,9 @@ class Replicas:
         self._loop = asyncio.new_event_loop()
         self._thread = threading.Thread(target=self._loop.run_forever)
         self._thread.start()
-        self.migrators = [SessionMigrator(partial(self._others, number), self._loop) for number in range(len(agents))]
+        self.migrators = [
+            SessionMigrator(str(number), partial(self._others, number), self._loop) for number in range(len(agents))
+        ]
         self.engines = [
             Engine(agent, finder=finder, **options) for agent, finder in zip(agents, self.migrators, strict=True)
         ]

@@ -70,16 +70,20 @@ class CheckpointChoice:
 DEFAULT = CheckpointChoice()
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(slots=True, eq=False)
 class Origin:
     """The origin of one sender's requests."""
 
     transport: str = ""  # transport, for the metrics
     owner: str = ""  # connection with which its sessions end; empty without one
-    connection: str = ""  # the sender, whose requests share one turn in the queue; if empty, each session has a turn
+    connection: str = ""  # the sender, whose requests share one turn in the queue; if empty, each session has a turn.
+    # It starts with the prefix, so that callers with different keys never share a turn.
     caller: Caller | None = None  # None if no key is required
     prefix: str = ""  # prefix of the session ids of the caller's key
-    sessions: set[str] = field(default_factory=set)  # the owner's sessions, by their ids in the engine
+    # The owner's sessions, by their ids in the engine: the step at which the episode began that the owner last reset or
+    # acted in; None if it has done neither.
+    sessions: dict[str, int | None] = field(default_factory=dict)
+    ended: bool = False  # whether the connection has ended, so that its waiting requests do nothing more
 
 
 NOWHERE = Origin()
@@ -114,6 +118,9 @@ class PendingRequest:
     begun: bool = False  # whether a batch has taken it for the policy; set under the queue's lock
     sought: bool = False  # whether other replicas were searched for its session
     session: Any = None  # the `Session` of an act at its arrival
+    # Of an act: the step at which the episode began that it was sent in, once that is known. Of a reset: that of the
+    # connection's episode before, which goes on if the reset is undone.
+    episode: int | None = None
     opening: Opening | None = None  # for a reset: the server's settings
     # If a reset had to wait for its checkpoint: the time at which that was loaded, s. Such a reset runs even if it is
     # over, to release the checkpoint.
@@ -149,6 +156,11 @@ class PendingRequest:
     def expired(self, now: float) -> bool:
         """Return whether the deadline has passed at `now`, s."""
         return now > self.deadline
+
+    @property
+    def is_abandoned(self) -> bool:
+        """Whether the request is over, or the connection that sent it has ended."""
+        return self.over or self.origin.ended
 
 
 class Message:

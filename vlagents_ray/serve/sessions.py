@@ -11,7 +11,7 @@ import time
 from collections import Counter, OrderedDict
 from collections.abc import Callable, Container, Iterable, Mapping
 from dataclasses import dataclass, field
-from typing import Generic, Protocol, TypeVar
+from typing import Any, Generic, Protocol, TypeVar
 
 from vlagents_ray.errors import PolicyUnavailable, TooManyRequests, UnknownSession
 from vlagents_ray.interface import Agent
@@ -51,6 +51,7 @@ class Session(Generic[M]):
     steps: int = 0  # step of its state: drawn at each reset, above all earlier steps, and incremented by each act
     first: int = 0  # step drawn at the last reset that was run
     expected: int = 0  # step drawn for the latest reset, which may still be queued
+    began: float = 0.0  # time at which that reset arrived, s, of the engine's clock
     moves: int = 0  # number of moves between replicas since the last reset
     announced: bool = False  # whether it was announced to the other replicas, which then keep no older state
     used: float = field(default_factory=time.monotonic)  # time of its last request, s
@@ -67,12 +68,25 @@ class Session(Generic[M]):
             f"or this is another episode: reset it"
         )
 
+    def wrong_episode(self) -> UnknownSession:
+        """Return the error for an act that was sent in another episode."""
+        return UnknownSession(
+            f"session {self.id!r}: another episode has begun since the act was sent, or the reset before the act was "
+            f"not executed: reset it, or send the episode's step"
+        )
+
 
 class SessionFinder(Protocol):
     """Fetches sessions from other replicas: `vlagents_ray.serve.scaling.session_migration.SessionMigrator`."""
 
-    def fetch(self, session_id: str, then: Callable[[], None], caller: str = "") -> bool:
-        """Fetch a session, then call `then`, found or not; return False, without that, if `caller` has too many."""
+    def fetch(
+        self,
+        session_id: str,
+        then: Callable[[], None],
+        caller: str = "",
+        fits: Callable[[dict[str, Any], float], bool] = ...,
+    ) -> bool:
+        """Fetch a session that `fits`, then call `then`, found or not; return False if `caller` has too many."""
 
     def announce(self, session_id: str, step: int) -> None:
         """Announce to the other replicas that the session began an episode here at `step`; their states are older."""

@@ -261,18 +261,19 @@ def test_what_comes_twice_or_late_changes_nothing(replicas: Callable[[int], Repl
     a, b, c = served.engines
     ask(a, "reset", instruction="episode 1")
     state = serve(served, 0, "copy", "robot-1")
-    assert serve(served, 0, "release", "robot-1", version_of(state), "one") is True
-    assert serve(served, 0, "release", "robot-1", version_of(state), "another") is False
-    assert serve(served, 0, "release", "robot-1", version_of(state), "one") is True
-    for _ in range(2):
-        assert serve(served, 1, "take_over", "robot-1", state) is True
+    assert serve(served, 1, "take_over", "robot-1", "0") is True
+    assert serve(served, 0, "release", "robot-1", version_of(state), "late") is False
+    assert serve(served, 1, "take_over", "robot-1", "0") is False  # it is no longer there
+    assert [len(engine.sessions) for engine in (a, b, c)] == [0, 1, 0]
     assert obeys(c) == ("episode 1", 1)  # fetched from there
-    for number in (1, 2):
-        assert serve(served, number, "take_over", "robot-1", state) is True  # it need not be given to another one
+    with pytest.raises(UnknownSession, match="newer"):
+        b.adopt("robot-1", state)
     assert [len(engine.sessions) for engine in (a, b, c)] == [0, 0, 1]
     returned = serve(served, 2, "copy", "robot-1")
-    assert serve(served, 2, "release", "robot-1", version_of(returned), "two") is True
-    assert serve(served, 0, "take_over", "robot-1", returned) is True
+    assert serve(served, 2, "release", "robot-1", version_of(returned), "one") is True
+    assert serve(served, 2, "release", "robot-1", version_of(returned), "another") is False
+    assert serve(served, 2, "release", "robot-1", version_of(returned), "one") is True
+    a.adopt("robot-1", returned)
     serve(served, 0, "release", "robot-1", version_of(state), "one")
     assert obeys(a) == ("episode 1", 2)
 
@@ -282,7 +283,7 @@ def test_a_slow_replica_that_was_given_a_session_is_waited_for(replicas: Callabl
     a, b, c = served.engines
     for number in range(20):
         ask(a, "reset", f"robot-{number}", instruction=f"{number}")
-    with slow(b, "adopt") as (begun, release):
+    with slow(b, "prepare_adoption") as (begun, release):
         given = threading.Thread(target=served.hand_over, args=[0])
         given.start()
         wait_for(lambda: len(c.sessions) == 10 and begun.qsize() > 3)  # of several at a time
@@ -333,7 +334,7 @@ def test_a_session_on_its_way_to_another_replica_is_waited_for(replicas: Callabl
     served = replicas(3)
     a, b, c = served.engines
     ask(a, "reset", instruction="episode 1")
-    with slow(b, "adopt") as (begun, release):
+    with slow(b, "prepare_adoption") as (begun, release):
         given = threading.Thread(target=served.hand_over, args=[0])
         given.start()
         begun.get(timeout=20)

@@ -17,6 +17,7 @@ from typing import Any
 
 from vlagents_ray.contract import Contract
 from vlagents_ray.errors import (
+    ConnectionLost,
     DeadlineExceeded,
     NotReset,
     OutcomeUnknown,
@@ -303,6 +304,8 @@ class Engine:
                 raise NotReset(f"session {pending.session_id!r}: act before a successful reset; reset first")
             if (step := request.step) is not None and step > session.steps and step > session.expected:
                 raise session.wrong_step(step)
+            if pending.episode is None:
+                pending.episode = self._episode_of(pending, session)
             session.origin = origin
             if (model := session.model) is not None:  # another thread may set it to None
                 model.check(request)
@@ -315,9 +318,36 @@ class Engine:
                 model.check(request)
             session = self.sessions.open(pending.session_id, origin)
             opening.first = self.sessions.begin(session, request.step)
+            session.began = pending.arrived
             pending.opening = opening
         if origin.owner and request.op != "close":
-            origin.sessions.add(pending.session_id)
+            self._bind(pending)
+
+    def _episode_of(self, pending: PendingRequest, session: Session[LoadedModel]) -> int:
+        """Return the step at which the episode began that an act without a step belongs to.
+
+        That is the episode which the connection has last reset or acted in, otherwise the session's latest one. An act
+        that waited for a search of its session does not belong to an episode that began meanwhile.
+        """
+        known = pending.origin.sessions.get(pending.session_id)
+        if known is not None:
+            return known
+        if pending.sought and session.began >= pending.arrived and pending.request.step is None:
+            raise session.wrong_episode()
+        return session.expected
+
+    def _bind(self, pending: PendingRequest) -> None:
+        """Record the session of a request as one of its connection's, with the episode that the request belongs to."""
+        sessions, session_id = pending.origin.sessions, pending.session_id
+        if pending.opening is not None:
+            pending.episode = sessions.get(session_id)
+            sessions[session_id] = pending.opening.first
+        elif pending.request.op == "act":
+            sessions[session_id] = pending.episode
+        elif pending.request.op == "adopt":
+            sessions[session_id] = None
+        else:
+            sessions.setdefault(session_id, None)
 
     def withdraw(self, *requests: PendingRequest) -> None:
         """End requests without an answer, as `BatchQueue.withdraw` does, and undo resets that have not begun."""
@@ -327,8 +357,12 @@ class Engine:
             self._undo(pending)
 
     def _undo(self, pending: PendingRequest) -> None:
-        if pending.opening is not None and not pending.begun:
-            self.sessions.undo(pending.session_id, pending.opening.first)
+        if pending.opening is None or pending.begun:
+            return
+        self.sessions.undo(pending.session_id, pending.opening.first)
+        sessions = pending.origin.sessions
+        if sessions.get(pending.session_id) == pending.opening.first:
+            sessions[pending.session_id] = pending.episode
 
     def _fail(self, pending: PendingRequest, error: VLAgentsError) -> None:
         """Finish a request with an error, and undo a reset that has not begun."""
@@ -340,33 +374,47 @@ class Engine:
 
         If its session is not found, the act fails with the `error`.
         """
-        if self.finder is None or pending.sought or pending.request.op != "act":
+        if self.finder is None or pending.sought or pending.request.op != "act" or pending.is_abandoned:
             return False
         if not isinstance(error, UnknownSession):
             return False
         pending.sought, pending.begun = True, False
 
         def retry() -> None:
+            if pending.is_abandoned:
+                pending.fail(error)
+                return
             try:
                 self.check(pending)
-                if not pending.over:  # otherwise the caller no longer waits
-                    self.queue.put(pending)
+                self.queue.put(pending)
             except VLAgentsError as again:
                 pending.fail(error if type(again) is type(error) else again)
 
         origin = pending.origin
-        if self.finder.fetch(pending.session_id, retry, origin.owner if origin.caller is None else origin.caller.name):
+        searcher = origin.owner if origin.caller is None else origin.caller.name
+        if self.finder.fetch(pending.session_id, retry, searcher, partial(self._can_act_on, pending)):
             return True
         if self.draining:  # the replica has given its sessions to others
             pending.fail(PolicyUnavailable("the replica is stopping; connect again, or send the same request again"))
             return True
         return False
 
+    def _can_act_on(self, pending: PendingRequest, state: dict[str, Any], began: float) -> bool:
+        """Return whether an act would be executed on a session in that state, which another replica has exported.
+
+        If it would not be, the session stays where it is. The session's episode `began` at that time, s.
+        """
+        if pending.is_abandoned:
+            return False
+        if pending.request.step is not None:
+            return bool(pending.request.step == state["steps"])
+        episode = pending.episode or pending.origin.sessions.get(pending.session_id)
+        return began < pending.arrived if episode is None else bool(episode == state["first"])
+
     def run(self, taken: Taken) -> None:
         """Answer the expired requests, and run the batch. Called on the policy's thread."""
         for pending in taken.expired:
-            deadline_ms = pending.request.deadline_ms
-            self._fail(pending, DeadlineExceeded(f"no action within {deadline_ms:g} ms: dropped before inference"))
+            self._fail(pending, _not_taken(pending))
         if not taken.batch:
             self.sessions.drop_idle()
             return
@@ -480,7 +528,7 @@ class Engine:
 
     def _is_abandoned(self, pending: PendingRequest, session: Session[LoadedModel]) -> bool:
         """Return whether the caller of that reset no longer waits, or the session was reset again."""
-        return pending.over or pending.expired(self.clock()) or session.resetting is not pending
+        return pending.is_abandoned or pending.expired(self.clock()) or session.resetting is not pending
 
     def _other(self, pending: PendingRequest) -> dict[str, Any]:
         """Run a request that is neither an act nor a reset, and return the info of its answer."""
@@ -497,7 +545,7 @@ class Engine:
             self.weights.obey(**request.kwargs)
         else:
             self.sessions.close(session_id)
-            pending.origin.sessions.discard(session_id)
+            pending.origin.sessions.pop(session_id, None)
         return {}
 
     def _ready(self, pending: PendingRequest) -> tuple[Session[LoadedModel], LoadedModel, WeightsVersion]:
@@ -510,6 +558,8 @@ class Engine:
         step = pending.request.step
         if step is not None and step != session.steps:
             raise session.wrong_step(step)
+        if step is None and pending.episode is not None and pending.episode != session.first:
+            raise session.wrong_episode()
         if model is None or weights is None:
             raise UnknownSession(f"session {pending.session_id!r}: has just been closed; reset it")
         return session, model, weights
@@ -603,6 +653,7 @@ class Engine:
             "steps": session.steps,
             "first": session.first,
             "moves": session.moves,
+            "age_s": self.clock() - session.began,
             "version": list(model.version),
             "choice": [model.choice.name, model.choice.step],
             "settings": model.settings,
@@ -616,7 +667,8 @@ class Engine:
 
         Args:
             session_id: Id of the session.
-            state: The `info` of the other replica's reply to "export".
+            state: The `info` of the other replica's reply to "export". Its `age_s` is the time since the reset
+                arrived, s, at present or earlier.
             timeout_s: Maximum time for loading the session's checkpoint, s; 0 if it must be loaded already.
 
         Raises:
@@ -625,13 +677,24 @@ class Engine:
         """
         self.enter(self.prepare_adoption(session_id, state, timeout_s))
 
-    def prepare_adoption(self, session_id: str, state: dict[str, Any], timeout_s: float = 0.0) -> Session[LoadedModel]:
-        """Create a copy of the session that cannot act before `enter`; if it is not needed, release its model."""
+    def prepare_adoption(
+        self, session_id: str, state: dict[str, Any], timeout_s: float = 0.0, began: float | None = None
+    ) -> Session[LoadedModel]:
+        """Create a copy of the session that cannot act before `enter`; if it is not needed, release its model.
+
+        Its episode `began` at that time, s, of this engine's clock; by default it is computed from the state's `age_s`.
+        """
         self.require_ready()
         self.sessions.require_room(session_id)
         first, moves = state["first"], state["moves"] + 1
         arriving: Session[LoadedModel] = Session(
-            session_id, steps=state["steps"], first=first, expected=first, moves=moves, announced=True
+            session_id,
+            steps=state["steps"],
+            first=first,
+            expected=first,
+            began=self.clock() - state["age_s"] if began is None else began,
+            moves=moves,
+            announced=True,
         )
         try:
             model = self.models.adopt(arriving, CheckpointChoice(*state["choice"]), state["settings"], timeout_s)
@@ -653,6 +716,13 @@ class Engine:
         except BaseException:
             self.models.release(arriving)
             raise
+
+
+def _not_taken(pending: PendingRequest) -> VLAgentsError:
+    """Return the error for a request that the policy has not received, and never will."""
+    if pending.origin.ended:
+        return ConnectionLost("its connection has ended: not acted on, and never will be")
+    return DeadlineExceeded(f"no action within {pending.request.deadline_ms:g} ms: dropped before inference")
 
 
 def _send(answers: Sequence[tuple[PendingRequest, Reply]]) -> None:

@@ -73,7 +73,7 @@ class Sender:
         self._prefix = f"{caller.name}/" if isinstance(caller, Caller) else ""  # prefix of the sender's session ids
         self.session_id = self._prefix + self._session_id  # id of the sender's own session in the engine
         owner = uuid.uuid4().hex if connected else ""
-        self._origin = Origin(transport, owner, self._session_id, self._caller, self._prefix)
+        self._origin = Origin(transport, owner, self.session_id, self._caller, self._prefix)
 
     def message(self, op: str = "unknown", rank: str = "robot") -> Message:
         """Return a message that has just arrived from the sender, see `Message`."""
@@ -195,7 +195,7 @@ class Sender:
     def _answered(
         self, then: Answered, admission: MessageAdmission | None, watched: Sequence[PendingRequest], message: Message
     ) -> None:
-        if self._engine.drain_list.ask(self._session_id):
+        if self._engine.drain_list.ask(self.session_id):
             self._asked_to_reconnect = True
         if self._asked_to_reconnect or self._engine.draining:
             for reply in message.replies:
@@ -246,9 +246,12 @@ class Sender:
     def release(self, *, for_good: bool = False) -> None:
         """End the sessions of a closed connection, unless its client has to reconnect elsewhere.
 
+        Its requests that no batch has taken are answered with an error, and are never executed or searched for.
+
         The sessions of such a client are kept, for another replica to fetch. `for_good` ends them in any case, for
         protocols without a request to reconnect.
         """
+        self._origin.ended = True
         owner = self._origin.owner
         if owner and (for_good or not (self._asked_to_reconnect or self._engine.draining)):
             self._engine.sessions.close_owned(owner, tuple(self._origin.sessions))  # a migrator's thread may add one

@@ -31,7 +31,8 @@ class Taken(NamedTuple):
     """The work that the policy's thread takes at once; both lists are empty after a long time without requests."""
 
     batch: list[PendingRequest]
-    expired: list[PendingRequest]  # requests whose deadlines have passed: not in the batch, and still unanswered
+    # Requests whose deadlines have passed, or whose connections have ended: not in the batch, and still unanswered.
+    expired: list[PendingRequest]
 
 
 class BatchQueue:

@@ -105,10 +105,11 @@ class FairQueue:
         """Take the next batch of at most `size` requests.
 
         Returns:
-            The batch, and the expired requests, which are removed. Finished requests are dropped.
+            The batch, and the requests whose deadlines have passed or whose connections have ended, which are removed.
+            Finished requests are dropped.
         """
         lone = self._lone
-        if lone is not None and not lone.over and now <= lone.deadline:
+        if lone is not None and not lone.is_abandoned and now <= lone.deadline:
             self._lone = None
             lone.begun = True
             self.depth[lone.rank] = self.size = 0
@@ -157,7 +158,7 @@ class FairQueue:
             if pending.loaded is None:  # otherwise it must run, to release the checkpoint that its session holds
                 if pending.over:
                     continue
-                if pending.expired(now):
+                if pending.origin.ended or pending.expired(now):
                     expired.append(pending)
                     continue
             pending.begun = True

@@ -88,7 +88,7 @@ class PolicyReplica(ClientApi, SiblingApi):
 
         # The engine, and its parts that are shared with other replicas.
         self._peers = SiblingReplicas()
-        self._migrator = SessionMigrator(self._peers.others, asyncio.get_running_loop())
+        self._migrator = SessionMigrator(self._peers.own_name, self._peers.others, asyncio.get_running_loop())
         self._limits = settings.limits.limits()
         if 0 < settings.resources.num_gpus < 1:
             os.environ.setdefault(GPU_SHARE, str(settings.resources.num_gpus))

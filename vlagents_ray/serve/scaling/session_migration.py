@@ -1,8 +1,8 @@
 """Migration of sessions, when a replica stops or the load balancer sends a session's request to another replica.
 
 A replica that gets a request for an unknown session searches the other replicas for it, and continues the session in
-exactly the same state, including instruction, history and random generator. A replica that stops gives its remaining
-sessions to the others.
+exactly the same state, including instruction, history and random generator. A replica that stops lets the others fetch
+its remaining sessions.
 
 A move never duplicates or loses a session. It has three steps, of which only the second one changes a session:
 
@@ -47,6 +47,8 @@ P = ParamSpec("P")
 T = TypeVar("T")
 InThread = Callable[..., Awaitable[Any]]
 Spawn = Callable[[Coroutine[Any, Any, Any]], "asyncio.Task[Any]"]
+FetchFrom = Callable[[str, str], Awaitable[bool]]  # fetches a session from the replica of that name
+Fits = Callable[[dict[str, Any], float], bool]  # whether a request can use a session: its state, and its begin
 _PENDING = 4096  # largest number of concurrent searches of a caller; further requests get `UnknownSession` at once
 _ANSWER_S = 3.0  # time limit for another replica's answer; a replica that still loads does not answer
 _OTHERS_S = 0.3  # time limit for the remaining answers, once a replica has answered that it holds the session
@@ -69,10 +71,12 @@ class PeerUnreachable(Exception):
 class HeldSessions:
     """Exports, releases and adopts the sessions of one engine, on the replica's event loop."""
 
-    def __init__(self, engine: Engine, loop: asyncio.AbstractEventLoop, in_thread: InThread, spawn: Spawn) -> None:
-        """Move the sessions of an engine; `in_thread` runs a slow call (unpickling) on another thread."""
-        self._engine, self._loop = engine, loop
-        self._in_thread, self._spawn = in_thread, spawn
+    def __init__(
+        self, engine: Engine, loop: asyncio.AbstractEventLoop, name: str, fetch_from: FetchFrom, spawn: Spawn
+    ) -> None:
+        """Move the sessions of an engine, of the replica called `name`; `fetch_from` fetches one from a replica."""
+        self._engine, self._loop, self._name = engine, loop, name
+        self._fetch_from, self._spawn = fetch_from, spawn
         self._claims: OrderedDict[str, asyncio.Task[bool]] = OrderedDict()  # releases that other replicas requested
         self._released: OrderedDict[str, float] = OrderedDict()  # time of release by session, s
         self._leaving: dict[str, asyncio.Future[None]] = {}  # sessions being given away, until another replica has them
@@ -87,14 +91,22 @@ class HeldSessions:
         leaving = dict.fromkeys(filter(self.is_leaving, session_ids), (0, 0))
         return leaving | self._engine.sessions.held(session_ids)
 
-    async def copy(self, session_id: str) -> dict[str, Any] | None:
-        """Return the session's state after its queued acts; None if it is not here, or cannot be pickled."""
-        if session_id in self._leaving:
+    async def copy(self, session_id: str, offered: bool = False) -> dict[str, Any] | None:
+        """Return the session's state after its queued acts; None if it is not here, or cannot be pickled.
+
+        Its `age_s` is as of the call, not of the answer. `offered` is for the replica that `send_to_peer` called: there
+        is no time limit, since the session ends with this replica otherwise.
+        """
+        asked = self._engine.clock()
+        if session_id in self._leaving and not offered:
             await asyncio.wait([self._leaving[session_id]], timeout=EXPORT_S)
             return None
-        if self.is_leaving(session_id):
+        if self.is_leaving(session_id) and not offered:
             await asyncio.sleep(ON_ITS_WAY_S)
-        return await self._ask(session_id, "export", EXPORT_S)
+        state = await self._ask(session_id, "export", None if offered else EXPORT_S)
+        if state is not None:
+            state["age_s"] -= self._engine.clock() - asked
+        return state
 
     async def release(self, session_id: str, version: Version, claim: str) -> bool:
         """Release the session if it still has that version; return whether it was released.
@@ -102,7 +114,8 @@ class HeldSessions:
         A repeated call with the same `claim` returns the same answer, and has no further effect.
         """
         if claim not in self._claims:
-            self._claims[claim] = self._spawn(self._release(session_id, version, EXPORT_S))
+            timeout_s = None if session_id in self._leaving else EXPORT_S
+            self._claims[claim] = self._spawn(self._release(session_id, version, timeout_s))
             if len(self._claims) > _REMEMBERED:
                 self._claims.popitem(last=False)
         return await asyncio.shield(self._claims[claim])
@@ -122,22 +135,21 @@ class HeldSessions:
         left = self._loop.time() - self._released.get(session_id, float("-inf"))
         return session_id in self._leaving or (left < ARRIVAL_S and session_id not in self._engine.sessions)
 
-    async def take_over(self, session_id: str, state: dict[str, Any]) -> bool:
-        """Continue a session that the other replica has released.
+    async def take_over(self, session_id: str, holder: str) -> bool:
+        """Fetch a session from the replica called `holder`, which stops.
 
         Returns:
-            Whether the session is here; also True if a newer state of the session has replaced this one.
+            Whether the session is here; also True if a newer state of the session has replaced that one.
         """
         if self._engine.draining:
             return False
         try:
-            await self._in_thread(self._engine.adopt, session_id, state)
+            return await self._fetch_from(session_id, holder)
         except Outdated:  # the call is a repetition, or a newer state arrived first
             return True
         except VLAgentsError as error:
             logger.info("session %s: not taken over: %s", session_id, error)
             return False
-        return True
 
     async def drop_older(self, steps: dict[str, int]) -> None:
         """Close sessions that began an episode at another replica, at these steps."""
@@ -146,26 +158,19 @@ class HeldSessions:
     # Operations for this replica.
 
     async def send_to_peer(self, session_id: str, peers: Sequence[Peer]) -> None:
-        """Give the session to the first of `peers` that takes it over.
-
-        The next replica gets a request only if the previous one refused or has ended.
-        """
-        state = await self._ask(session_id, "export", None)  # no time limit: otherwise the session would end here
-        if state is None or not peers:
-            return
+        """Let the first of `peers` that can do so fetch the session, which stays here until that replica has a copy."""
         self._leaving[session_id] = self._loop.create_future()
         try:
-            if not await self._release(session_id, (state["steps"], state["moves"]), None):
-                return
             for peer in peers:
+                if session_id not in self._engine.sessions:
+                    return
                 try:
-                    if await peer.ask(HeldSessions.take_over, session_id, state):
+                    if await peer.ask(HeldSessions.take_over, session_id, self._name):
                         return
                 except PeerEnded:
                     continue
                 except PeerUnreachable as error:
-                    logger.warning("session %s: given to a replica that does not answer: %s", session_id, error)
-                    return
+                    logger.warning("session %s: offered to a replica that does not answer: %s", session_id, error)
         finally:
             self._leaving.pop(session_id).set_result(None)
 
@@ -221,35 +226,40 @@ class SessionMigrator:
     may be called on any thread.
     """
 
-    def __init__(self, peers: Peers, loop: asyncio.AbstractEventLoop, in_thread: InThread | None = None) -> None:
-        """Create the migrator of one replica.
+    def __init__(
+        self, name: str, peers: Peers, loop: asyncio.AbstractEventLoop, in_thread: InThread | None = None
+    ) -> None:
+        """Create the migrator of the replica that its peers call `name`.
 
         `in_thread` runs a slow call (unpickling, loading a checkpoint) on another thread, by default a dedicated one.
         """
-        self._peers = peers
+        self._name, self._peers = name, peers
         self._threads = ThreadPoolExecutor(_AT_ONCE, thread_name_prefix="session-migration")
         self._in_thread = in_thread or partial(loop.run_in_executor, self._threads)
         self._loop = loop
         self._closed = False
         self._lock = threading.Lock()
-        self._callbacks: dict[str, list[Callable[[], None]]] = {}  # callbacks by session, until its search is over
+        self._callbacks: dict[str, list[tuple[Callable[[], None], Fits]]] = {}  # by session, until its search is over
         self._next_query: dict[str, asyncio.Future[_Answers]] = {}  # sessions of the next query
         self._callers: Counter[str] = Counter()  # number of running searches by caller
         self._unannounced: dict[str, int] = {}  # steps of begun episodes that are not announced yet, by session
+        self._offered = 0  # number of sessions that are being fetched since other replicas offered them
         self._silent: dict[str, float] = {}  # time until which a silent replica gets no request, by its name
         self._tasks: set[asyncio.Task[Any]] = set()
 
     def start(self, engine: Engine) -> None:
         """Set the engine whose sessions move; this migrator is its `finder`."""
         self._engine = engine
-        self.held = HeldSessions(engine, self._loop, self._in_thread, self._spawn)
+        self.held = HeldSessions(engine, self._loop, self._name, self._fetch_from, self._spawn)
 
-    def fetch(self, session_id: str, then: Callable[[], None], caller: str = "") -> bool:
+    def fetch(self, session_id: str, then: Callable[[], None], caller: str = "", fits: Fits = lambda *_: True) -> bool:
         """Fetch a session from another replica.
 
         Args:
             then: Called once the session is here or was not found.
             caller: Owner of the search; the number of concurrent searches per caller is limited.
+            fits: Returns whether a session with that exported state, whose episode began at that time, is of use. A
+                session that no caller can use is not moved.
 
         Returns:
             False if `then` will not be called, since `caller` has too many searches or the migrator is closed.
@@ -267,9 +277,9 @@ class SessionMigrator:
                 then()
 
             if session_id in self._callbacks:
-                self._callbacks[session_id].append(finished)
+                self._callbacks[session_id].append((finished, fits))
                 return True
-            self._callbacks[session_id] = [finished]
+            self._callbacks[session_id] = [(finished, fits)]
         self._loop.call_soon_threadsafe(lambda: self._spawn(self._search(session_id)))
         return True
 
@@ -292,14 +302,14 @@ class SessionMigrator:
         tried = set[tuple[str, Version]]()
         while True:
             here = sorted(self._engine.sessions.versions().items() - tried)
-            if not here and not self._callbacks:
+            if not (here or self._callbacks or self._offered):
                 break
             tried.update(here)
             peers = await self._responsive_first() if here else []
             orders = [peers[i:] + peers[:i] for i in range(max(1, len(peers)))]  # round-robin over the replicas
             transfers = [transfer(session_id, orders[i % len(orders)]) for i, (session_id, _) in enumerate(here)]
             await asyncio.gather(*transfers)
-            if not here:  # sessions are still being fetched for earlier requests
+            if not here:  # sessions are still being fetched, for earlier requests or since they were offered
                 await asyncio.sleep(ON_ITS_WAY_S)
         self._closed = True
         self._engine.stop(0.0)  # later requests are refused, so that clients send them to the new replica
@@ -345,11 +355,33 @@ class SessionMigrator:
         finally:
             self._finish(session_id)
 
-    async def _move(self, session_id: str, peer: Peer) -> bool:
-        """Move the session from that replica to this one; return False if its state there has changed."""
-        if (state := await self._answer(peer.ask(HeldSessions.copy, session_id), EXPORT_S)) is None:
+    async def _fetch_from(self, session_id: str, holder: str) -> bool:
+        """Fetch a session from the replica called `holder`, which offers it; return whether it is here."""
+        self._offered += 1
+        try:
+            for peer in await self._peers():
+                if peer.name == holder:
+                    return await self._move(session_id, peer, offered=True)
             return False
-        arriving = await self._in_thread(self._engine.prepare_adoption, session_id, state, _LOAD_S)
+        finally:
+            self._offered -= 1
+
+    async def _move(self, session_id: str, peer: Peer, *, offered: bool = False) -> bool:
+        """Move the session from that replica to this one; return False if its state there has changed.
+
+        A session that the replica has not `offered` is moved only if one of the waiting requests can act on it.
+        """
+        asked = self._engine.clock()
+        copying = peer.ask(HeldSessions.copy, session_id, offered)
+        state = await self._answer(copying, None if offered else EXPORT_S)
+        if state is None:
+            return False
+        # The other replica received the call later than `asked`, so that this is no later than the episode's true
+        # begin: an act that arrived after the reset is never taken for one of an older episode.
+        began = asked - state["age_s"]
+        if not (offered or self._is_of_use(session_id, state, began)):
+            return True
+        arriving = await self._in_thread(self._engine.prepare_adoption, session_id, state, _LOAD_S, began)
         version = state["steps"], state["moves"]
         release = self._spawn(self._answer(peer.ask(HeldSessions.release, session_id, version, uuid.uuid4().hex)))
         while not (await asyncio.wait([release], timeout=_ANSWER_S))[0]:
@@ -363,6 +395,11 @@ class SessionMigrator:
             "session %s: fetched from another replica, after %d acts", session_id, state["steps"] - state["first"]
         )
         return True
+
+    def _is_of_use(self, session_id: str, state: dict[str, Any], began: float) -> bool:
+        with self._lock:
+            callbacks = list(self._callbacks.get(session_id, ()))
+        return any(fits(state, began) for _, fits in callbacks)
 
     def _answers(self, session_id: str) -> asyncio.Future[_Answers]:
         """Return a future of the other replicas' answers to one query about all sessions that are being searched."""
@@ -431,7 +468,7 @@ class SessionMigrator:
     def _finish(self, session_id: str) -> None:
         with self._lock:
             callbacks = self._callbacks.pop(session_id, [])
-        for then in callbacks:
+        for then, _ in callbacks:
             try:
                 then()
             except Exception:
