@@ -7,10 +7,11 @@ Physical Intelligence's own code and checkpoints are `vlagents_ray.policies.open
 from __future__ import annotations
 
 import json
+import logging
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Literal
 
 import numpy as np
 from pydantic import Field
@@ -28,13 +29,19 @@ from vlagents_ray.policies.compilation import Compilation
 from vlagents_ray.policies.flow import OFFERED, FlowPasses, cache_of, layers_of, stack_of
 from vlagents_ray.registry import require
 
+logger = logging.getLogger(__name__)
+
 CAMERAS = ("base_0_rgb", "left_wrist_0_rgb", "right_wrist_0_rgb")  # openpi's names, in the order of the image tokens
 USUAL_CAMERAS = {"base_0_rgb": "front", "left_wrist_0_rgb": "wrist"}
 USUAL_STATE = ("xyz_axis_angle", "gripper_qpos")  # LIBERO
 _ROUNDING = 1e-5  # of float32, for pixels of about 1
 _EPSILON = 1e-8  # added to a standard deviation by PI0Processor
+_BILINEAR = 2  # Pillow's number of that filter
 _PROCESSOR = "processor_config.json"
 _STATISTICS = ("state_mean", "state_std", "actions_mean", "actions_std")
+
+
+InputStyle = Literal["transformers", "openpi"]
 
 
 class Pi0Config(ModelConfig):
@@ -43,6 +50,11 @@ class Pi0Config(ModelConfig):
     cameras: dict[str, str] | None = Field(
         default=None,
         description=f"those of {', '.join(CAMERAS)} that it was trained with -> ours; unset: {USUAL_CAMERAS}",
+    )
+    images: InputStyle | None = Field(
+        default=None,
+        description="whose code prepared images and instructions in training: openpi for weights converted from there; "
+        "unset: transformers, unless its image processor resizes bilinearly or does not pad",
     )
     steps: int | None = Field(default=None, ge=1, description="steps of the flow; unset: the checkpoint's, usually 10")
     max_tokens: int = Field(default=48, ge=1, description="tokens of an instruction, as in training; more are refused")
@@ -59,7 +71,7 @@ class LoadedPi0:
     dtype: Any
     passes: Pi0HfPasses
     staging: Staging
-    scale: tuple[Any, Any]  # see `_scale`
+    scale: tuple[Any, Any, Any]  # see `_scale`
 
     def planned(self, row: Row) -> Row:
         """Return the row with its leftover actions in the model's units."""
@@ -122,6 +134,8 @@ class Pi0(ModelPolicy):
         passes = Pi0HfPasses(network, self.compilation)
         passes.adapters = self.adapters
         processor, staging = _processor(path), Staging(device)
+        style = self._style(processor)
+        logger.info("images and instructions are prepared as in %s; `images` changes that", style)
         return LoadedPi0(network, processor, dtype, passes, staging, _scale(processor, staging))
 
     def adapt(self, adapter: str, folder: Path) -> None:
@@ -143,17 +157,47 @@ class Pi0(ModelPolicy):
 
         Several threads call it, so it never uses the tokenizer, whose padding is mutable state.
         """
-        processor = self.loaded().processor
-        torch, side = require("torch"), processor.image_processor.pad_size
-        found = camera_images(obs, self.cameras)
-        images = [resize_with_pad(found[name], side["height"], side["width"]) for name in self.cameras]
+        processor, torch = self.loaded().processor, require("torch")
+        cameras = camera_images(obs, self.cameras)
+        images = self._resized([cameras[name] for name in self.cameras])
         state = np.zeros(processor.max_state_dim, np.float32)
         values = state_vector(obs, self.state, self.state_dim)
         state[: len(values)] = processor.normalize(torch.from_numpy(values), "state")
-        staged: StagedRow = self.loaded().staging.stage(
-            {**self._begun().prompt, "images": np.stack(images), "state": state}
-        )
+        staged: StagedRow = self.loaded().staging.stage({**self._begun().prompt, **images, "state": state})
         return staged
+
+    def _style(self, processor: Any) -> InputStyle:
+        """Return whose preparation of images and instructions the checkpoint was trained with."""
+        images = processor.image_processor
+        resizes_as_openpi = images.resample is not None and int(images.resample) == _BILINEAR
+        usual: InputStyle = "transformers" if images.do_resize and images.do_pad and not resizes_as_openpi else "openpi"
+        return self.config.images or usual
+
+    def _resized(self, images: Sequence[np.ndarray]) -> dict[str, np.ndarray]:
+        """Resize the images (H, W, 3) of all cameras, and pad them with zeros.
+
+        Returns:
+            "images" (cameras, S, S, 3) uint8; as in transformers, also "sizes" (cameras, 2) int64, in pixels: those of
+            the resized images at the upper left, since transformers pads them after it has scaled the colours.
+        """
+        processor = self.loaded().processor.image_processor
+        height, width = processor.pad_size["height"], processor.pad_size["width"]
+        if self._style(self.loaded().processor) == "openpi":
+            return {"images": np.stack([resize_with_pad(image, height, width) for image in images])}
+        padded = np.zeros((len(images), height, width, 3), np.uint8)
+        sizes = np.zeros((len(images), 2), np.int64)
+        for i, image in enumerate(images):
+            resized = processor(
+                [image],
+                do_rescale=False,
+                do_normalize=False,
+                do_pad=False,
+                input_data_format="channels_last",
+                return_tensors="np",
+            )["pixel_values"][0]
+            sizes[i] = resized.shape[1:]
+            padded[i, : sizes[i, 0], : sizes[i, 1]] = np.moveaxis(resized, 0, -1)
+        return {"images": padded, "sizes": sizes}
 
     def _begin(self, instruction: str, seed: int, adapter: str = "") -> None:
         """Begin an episode and tokenize its instruction; one longer than in training is refused, not truncated."""
@@ -162,8 +206,9 @@ class Pi0(ModelPolicy):
             return
         processor, most = self.model.processor, self.config.max_tokens
         patches = len(self.cameras) * processor.image_seq_length
+        text = _openpi_text(instruction) if self._style(processor) == "openpi" else instruction
         tokens = processor.tokenizer(
-            [f"{processor.image_token * patches}{processor.tokenizer.bos_token}{instruction}\n"],
+            [f"{processor.image_token * patches}{processor.tokenizer.bos_token}{text}\n"],
             padding="max_length",
             max_length=patches + most,
             padding_side="right",
@@ -204,8 +249,14 @@ class Pi0(ModelPolicy):
         model, torch = self.loaded(), require("torch")
         inputs = model.staging.stack([row.frames[-1] for row in rows])
         images = inputs.pop("images").movedim(-1, 2)  # (P, cameras, 3, S, S)
-        factor, summand = model.scale
+        factor, summand, padding = model.scale
         pixels = images.to(torch.float32, memory_format=torch.contiguous_format).mul_(factor).add_(summand)
+        if (sizes := inputs.pop("sizes", None)) is not None:
+            height, width = images.shape[-2:]
+            rows_inside = torch.arange(height, device=images.device) < sizes[..., :1]  # (P, cameras, S)
+            columns_inside = torch.arange(width, device=images.device) < sizes[..., 1:]
+            inside = rows_inside[..., :, None] & columns_inside[..., None, :]
+            pixels = torch.where(inside[:, :, None], pixels, padding)
         return {
             **inputs,
             "pixel_values": pixels.to(model.dtype),
@@ -221,6 +272,11 @@ def _cameras(chosen: Mapping[str, str] | None) -> dict[str, str]:
     return choose_cameras(chosen, USUAL_CAMERAS, known)
 
 
+def _openpi_text(instruction: str) -> str:
+    """Return an instruction as openpi's `PaligemmaTokenizer` cleans it."""
+    return instruction.strip().replace("_", " ").replace("\n", " ")
+
+
 def _processor(path: Path) -> Any:
     processor = require("transformers").PI0Processor.from_pretrained(path, local_files_only=True)
     if absent := [name for name in _STATISTICS if getattr(processor, name) is None]:
@@ -231,8 +287,10 @@ def _processor(path: Path) -> Any:
     return processor
 
 
-def _scale(processor: Any, staging: Staging) -> tuple[Any, Any]:
-    """Return the factor and the summand, (3, 1, 1) float32 on the device, by which a processor converts pixels.
+def _scale(processor: Any, staging: Staging) -> tuple[Any, Any, Any]:
+    """Return the factor and the summand by which a processor converts pixels, and the colour with which it pads them.
+
+    They are (3, 1, 1) float32 on the device.
 
     Raises:
         ConfigError: It does anything else with an image of its own size.
@@ -248,7 +306,9 @@ def _scale(processor: Any, staging: Staging) -> tuple[Any, Any]:
             f"{_PROCESSOR}: its image processor changes an image of {levels.shape} by more than a factor and a summand "
             f"for each channel, want do_rescale and do_normalize alone; images are resized before"
         )
-    return staging.upload(factor), staging.upload(summand)
+    wide = processor.image_processor([image[: len(image) // 2]], return_tensors="np")["pixel_values"][0]
+    padding = np.asarray(wide[:, -1:, -1:], np.float32) if wide.shape == found.shape else np.zeros_like(summand)
+    return staging.upload(factor), staging.upload(summand), staging.upload(padding)
 
 
 class Pi0HfPasses(FlowPasses):

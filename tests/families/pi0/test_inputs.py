@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -17,6 +18,7 @@ from tests.families.pi0.conftest import WORDS, begun, made, seen
 from vlagents_ray.errors import ConfigError
 from vlagents_ray.interface import DELAY, LEFTOVER, SAMPLES, WANT, Obs
 from vlagents_ray.policies.base import Row
+from vlagents_ray.policies.base.model_inputs import resize_with_pad
 from vlagents_ray.policies.base.staging import Staging
 from vlagents_ray.policies.compilation import Compilation
 from vlagents_ray.policies.pi0 import LoadedPi0, Pi0, Pi0HfPasses, _scale
@@ -53,6 +55,64 @@ def test_inputs_are_those_of_the_processor_itself(folder: Path, settings: dict[s
     for name, tensor in wanted.items():
         assert found[name].dtype == tensor.dtype or name == "pixel_values"  # bytes without `do_rescale`
         torch.testing.assert_close(found[name].to(tensor.dtype), tensor, rtol=1e-6, atol=1e-6)
+
+
+SIDES = ((480, 640), (640, 480), (224, 224), (100, 37), (1080, 1920))
+
+
+@pytest.mark.verifies("parity")
+@pytest.mark.parametrize("images", [None, "transformers"])
+def test_images_of_any_size_are_those_of_the_processor_itself(folder: Path, images: str | None) -> None:
+    policy = made(folder, images=images)
+    assert policy.model is not None
+    for i, side in enumerate(SIDES):
+        obs = seen(i, side)
+        obs.cameras["wrist"] = seen(i, SIDES[i - 1]).cameras["wrist"]  # of another size
+        found = policy._inputs([row(policy, i, obs)])
+        wanted = policy.model.processor(
+            images=[[obs.cameras["front"], obs.cameras["wrist"]]], text=[WORDS[0]], return_tensors="pt"
+        )
+        torch.testing.assert_close(found["pixel_values"], wanted["pixel_values"], rtol=1e-6, atol=1e-6)
+
+
+def test_images_for_openpis_weights_are_those_of_openpi(folder: Path) -> None:
+    policy = made(folder, images="openpi")
+    for i, side in enumerate(SIDES):
+        image = seen(i, side).cameras["front"]
+        np.testing.assert_array_equal(policy._resized([image])["images"][0], resize_with_pad(image, 224, 224))
+
+
+@pytest.mark.parametrize(
+    ("settings", "style"),
+    [
+        ({}, "transformers"),
+        ({"resample": 1}, "transformers"),
+        ({"resample": 2}, "openpi"),
+        ({"do_pad": False}, "openpi"),
+        ({"do_resize": False}, "openpi"),
+    ],
+)
+def test_the_image_processor_decides_unless_the_settings_do(folder: Path, settings: dict[str, Any], style: str) -> None:
+    processor = made(folder).loaded().processor
+    for name, value in settings.items():
+        setattr(processor.image_processor, name, value)
+    for chosen in (None, "transformers", "openpi"):
+        policy = Pi0.from_config({"checkpoint": str(folder), "images": chosen})
+        assert policy._style(processor) == (chosen or style)
+
+
+@pytest.mark.parametrize("words", ["pick_up the\ncube", "  push \n", "open the drawer"])
+def test_instructions_are_cleaned_as_the_training_did(folder: Path, words: str) -> None:
+    def tokens(images: str, text: str) -> list[int]:
+        policy = made(folder, images=images)
+        session = copy.copy(policy)
+        session.reset(seen(0), text, seed=0)
+        prompt = session._begun().prompt
+        return list(prompt["input_ids"][prompt["attention_mask"] == 1])
+
+    cleaned = words.strip().replace("_", " ").replace("\n", " ")  # openpi's tokenizer.py
+    assert tokens("openpi", words) == tokens("transformers", cleaned)
+    assert (tokens("transformers", words) == tokens("openpi", words)) == (words == cleaned)
 
 
 def test_a_processor_that_does_more_than_scale_is_refused() -> None:
