@@ -57,11 +57,33 @@ def _shown(value: object, most: int, levels: int) -> str:
     return f"{left}{', '.join(parts)}{right}"
 
 
+def printable(text: str) -> str:
+    """Return a text of another party without characters that command a terminal or forge a line of a log.
+
+    Control and format characters, such as escape sequences, become "�". Line feeds and tabs stay, but each further line
+    is indented, so that it cannot pass for a record of its own.
+    """
+    if text.isprintable():
+        return text
+    lines = text.splitlines()
+    shown_lines = ["".join(_printable_character(character) for character in line) for line in lines]
+    indented = [line if line.startswith((" ", "\t")) else f"  {line}" for line in shown_lines[1:]]
+    return "\n".join([*shown_lines[:1], *indented])
+
+
+def _printable_character(character: str) -> str:
+    return character if character.isprintable() or character == "\t" else "�"
+
+
 class VLAgentsError(Exception):
     """The base class of all errors that this package raises on purpose."""
 
     code: ClassVar[str] = "internal"
     status: ClassVar[int] = 500
+
+    def __str__(self) -> str:
+        """Return the message without control characters, as parts of it may come from a server or a client."""
+        return printable(super().__str__())
 
 
 class InvalidInput(VLAgentsError, ValueError):

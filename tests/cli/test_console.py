@@ -158,3 +158,24 @@ def test_all_commands_are_on_one_screen() -> None:
     names = re.findall(r"^│ ([a-z]\w*)  ", said, re.MULTILINE)
     assert names[:5] == ["serve", "eval", "robot", "demo", "doctor"]
     assert len(said.splitlines()) <= len(names) + 15  # no text needs a second line
+
+
+HOSTILE = (
+    "\x1b]0;TITLE\x07\x1b[2J\x1b]52;c;ZXZpbA==\x07\x1b[31mOK\x1b[0m \x9b31m \u202eevil\r\n"
+    "2026-11-28 INFO robot: restarted"
+)
+
+
+def commands_of_a_terminal(text: str) -> list[str]:
+    return [character for character in text if not (character.isprintable() or character in "\n\t")]
+
+
+def test_text_of_others_commands_no_terminal(shown: io.StringIO) -> None:
+    console.progress(HOSTILE)
+    console.say_error(HOSTILE)
+    rows = table(HOSTILE)
+    rows.add_row(HOSTILE)
+    console.out.print(rows)
+    console.print_json({HOSTILE: HOSTILE})
+    assert "OK" in shown.getvalue()
+    assert commands_of_a_terminal(shown.getvalue()) == []

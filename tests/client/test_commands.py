@@ -57,3 +57,14 @@ def test_what_is_not_allowed_is_refused_and_what_has_another_form_left_out() -> 
         inbox.came(Act(np.zeros(2, np.float32), info={COMMAND: stated}))
         assert inbox.obey(Control()) == []
         assert inbox.asking(Obs()).info == {}
+
+
+def test_the_name_of_a_key_forges_no_line_of_the_robots_log(caplog: pytest.LogCaptureFixture) -> None:
+    inbox = CommandInbox()
+    inbox.came(told("stop", by="lab\n2026-11-28 INFO robot: restarted by \x1b[2Janna"))
+    inbox.obey(Control())
+    [record] = caplog.records
+    first, *further = record.getMessage().split("\n")
+    assert "\x1b" not in record.getMessage()
+    assert all(line.startswith("  ") for line in further)
+    assert first == "stopped from the live page by lab"

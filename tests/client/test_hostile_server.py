@@ -15,6 +15,7 @@ import numpy as np
 import pytest
 
 from vlagents_ray import Act, Obs, RemoteAgent, VLAgentsError
+from vlagents_ray.errors import BY_CODE
 from vlagents_ray.policies.upstream.client import ClientOptions
 from vlagents_ray.policies.upstream.http import OpenVLAClient
 from vlagents_ray.protocol.frame_layout import pack, unpack
@@ -180,6 +181,18 @@ def test_metadata_with_a_value_of_any_type_is_read_or_an_error_of_the_package(en
             for transport in ("http", "auto", "websocket") if entry in ADDRESSES else ("http",):
                 with http_policy(metadata, GOOD_REPLY) as url, contextlib.suppress(VLAgentsError):
                     act_once(url, transport)
+
+
+@pytest.mark.parametrize("error", [VLAgentsError, *sorted(BY_CODE.values(), key=repr)])
+def test_text_of_a_server_neither_commands_a_terminal_nor_forges_a_line(error: type[VLAgentsError]) -> None:
+    detail = "\x1b[2J\x1b]52;c;ZXZpbA==\x07 \x9b31m \u202e\r\n2026-11-28 INFO robot: restarted by anna"
+    problem = {"code": error.code, "detail": detail}
+    with http_policy(METADATA, json.dumps(problem).encode(), "403 Forbidden") as url:
+        with pytest.raises(VLAgentsError) as raised:
+            act_once(url)
+        first, *further = str(raised.value).split("\n")
+    assert all(character.isprintable() for line in [first, *further] for character in line)
+    assert all(line.startswith("  ") for line in further)
 
 
 @pytest.mark.parametrize("status", ["200 OK", "500 Internal Server Error"])

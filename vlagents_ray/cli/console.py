@@ -7,13 +7,14 @@ import itertools
 import json
 import os
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Any, NoReturn
 
 import typer
 from pydantic import ValidationError
-from rich.console import Console, ConsoleDimensions
+from rich.console import Console, ConsoleDimensions, ConsoleOptions, RenderableType
+from rich.segment import Segment
 from rich.table import Table
 from rich.text import Text
 
@@ -32,11 +33,21 @@ class PlainConsole(Console):
     def __init__(self, **options: Any) -> None:
         super().__init__(markup=False, emoji=False, highlight=False, soft_wrap=True, **options)
 
+    def render(self, renderable: RenderableType, options: ConsoleOptions | None = None) -> Iterable[Segment]:
+        """Render without control characters of the text, which may be a server's or from others' results."""
+        for segment in super().render(renderable, options):
+            is_plain = segment.control is not None or segment.text.isprintable() or segment.text == "\n"
+            yield segment if is_plain else Segment(_without_controls(segment.text), segment.style)
+
     @property  # type: ignore[misc]
     def size(self) -> ConsoleDimensions:
         """The size in columns and lines; a file or a pipe is unbounded."""
         size = super().size
         return size if self.is_terminal else size._replace(width=10_000)
+
+
+def _without_controls(text: str) -> str:
+    return "".join(character if character.isprintable() or character in "\n\t" else "�" for character in text)
 
 
 def table(*columns: str, **options: Any) -> Table:

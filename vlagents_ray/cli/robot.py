@@ -25,7 +25,7 @@ from vlagents_ray.chunking.player import ChunkPlayer, PlayerSettings
 from vlagents_ray.client.agent import RemoteAgent
 from vlagents_ray.client.commands import CommandInbox
 from vlagents_ray.contract import Contract
-from vlagents_ray.errors import ConfigError, VLAgentsError
+from vlagents_ray.errors import ConfigError, VLAgentsError, printable
 from vlagents_ray.interface import Agent
 from vlagents_ray.robot.fit import Fit, Trained
 from vlagents_ray.robot.limits import Limits
@@ -71,7 +71,7 @@ def main(arguments: Sequence[str]) -> int:
         with _ended_by_signals():
             report = _run(options)
     except VLAgentsError as error:
-        print(f"{type(error).__name__}: {error}", file=sys.stderr)  # noqa: T201
+        print(printable(f"{type(error).__name__}: {error}"), file=sys.stderr)  # noqa: T201
         return 2
     if report.mostly_safe is not None:
         return MOSTLY_SAFE
@@ -115,7 +115,7 @@ def _ended_by_signals() -> Iterator[None]:
 
 
 def _run(options: argparse.Namespace) -> LoopReport:
-    say: Callable[[str], None] = lambda line: print(line, flush=True)  # noqa: E731, T201
+    say: Callable[[str], None] = lambda line: print(printable(line), flush=True)  # noqa: E731, T201
     hz = options.hz or _HZ
     deadline_s = 0.0 if options.mode == "async" else WAIT_S
     if options.deadline_ms is not None:

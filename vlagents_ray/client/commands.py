@@ -8,7 +8,7 @@ from collections.abc import Collection
 from dataclasses import dataclass, replace
 
 from vlagents_ray.chunking.control import Control
-from vlagents_ray.errors import ConfigError
+from vlagents_ray.errors import ConfigError, printable
 from vlagents_ray.interface import Act, Obs
 
 COMMAND = "command"  # the entry of `Act.info` with a command: {"id", "do", "by"}, str each
@@ -57,7 +57,7 @@ class CommandInbox:
         stated = act.info.pop(COMMAND, None)
         if not isinstance(stated, dict) or not all(isinstance(stated.get(name), str) for name in ("id", "do")):
             return
-        command = Command(stated["id"], stated["do"], str(stated.get("by", ""))[:_BY])
+        command = Command(stated["id"], stated["do"], printable(str(stated.get("by", ""))[:_BY]))
         if command.do in self._allow:
             self._waiting.append(command)
         elif command.do in COMMANDS:
