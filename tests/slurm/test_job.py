@@ -54,9 +54,9 @@ def test_jobs_that_follow_each_other_share_no_port(job: int) -> None:
         return Allocation.here(ENVIRONMENT | {"SLURM_JOB_ID": str(number)}).ports
 
     def numbers(found: Ports) -> set[int]:
-        return {found.gcs, found.client, found.metrics, found.serve}
+        return {found.gcs, found.client, found.metrics, found.serve, found.export}
 
-    assert len(numbers(ports(job))) == 4
+    assert len(numbers(ports(job))) == 5
     assert not numbers(ports(job)) & numbers(ports(job + 1))
     assert all(10_000 <= port < 20_000 for port in numbers(ports(job)))
 
@@ -102,6 +102,9 @@ def test_the_connection_information_has_all_that_a_client_needs() -> None:
     assert found["apps"] == {"pi0": f"http://{host}:9000/pi0", "noop": f"http://{host}:9000"}
     assert (found["job"], found["key"], found["address"]) == (12, "vlr_x", "10.0.0.5")
     assert found["ssh"] == f"ssh -N -L 9000:{host}:9000 me@login1"
+    started = Allocation.here(ENVIRONMENT | SERVER).ray_start("10.0.0.5", "folder")
+    [exported] = [word.partition("=")[2] for word in started if word.startswith("--metrics-export-port=")]
+    assert found["metrics"] == f"http://{host}:{exported}/metrics"
 
 
 def test_people_are_told_the_same() -> None:

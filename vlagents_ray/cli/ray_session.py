@@ -19,7 +19,7 @@ from vlagents_ray.cli.console import err, say_error
 from vlagents_ray.errors import ClusterLost, ConfigError
 from vlagents_ray.ray_tools.private import LOGGERS, node_of_this_process
 from vlagents_ray.ray_tools.session import started_here
-from vlagents_ray.ray_tools.signals import raise_dropped_interrupt
+from vlagents_ray.ray_tools.signals import is_interrupted, raise_dropped_interrupt
 
 log = logging.getLogger(__name__)
 
@@ -33,6 +33,7 @@ RESUME = "what was played is kept: go on with --resume when there is a cluster a
 _FILE_BYTES = 10_000_000  # Serve logs each request; twice as much is kept
 _FOLLOW_S = 0.3  # period at which the log files of Ray's processes are read
 _LOG_FILES = ("worker-*.out", "worker-*.err", "raylet*.err")  # names in the folder of Ray's logs
+_DAEMON = "raylet"
 _ACTOR = ":actor_name:"  # begins the line that names the actor of the file
 _TITLES = (_ACTOR, ":task_name:", ":job_id:")
 _LOAD_FAILURES = ("Exception in Replica(", "Failed to update the deployments", "the policy did not load")
@@ -113,7 +114,9 @@ class _Terminal:
         elif _SERVES_LINE.match(line):
             self.failing.discard(process)
         starting = self._started is not None and not self._started.is_set()
-        if (starting and process in self.failing) or not _is_problem(line, level):
+        # A signal to the whole process group also ends Ray's daemon, which then guesses at causes.
+        guessed = process == _DAEMON and is_interrupted()
+        if guessed or (starting and process in self.failing) or not _is_problem(line, level):
             self._note(text)
         else:
             sys.stderr.write(f"{text}\n")

@@ -99,6 +99,7 @@ def serve_command(options: ServeOptions) -> None:
             started.set()
             for line in connection_lines(with_gateways_at(config, host), server.apps, host, keys, insecure=insecure):
                 out.print(line)
+            out.print(f"metrics for Prometheus: {', '.join(server.metrics)}")
             if address is None:
                 out.print(f"in a Ray program on this machine: vlagents_ray.join({server.url!r})")
             out.print(f"log of Ray, Serve and HAProxy: {log}")

@@ -8,6 +8,7 @@ private methods of Serve, which sends that module by value to processes that may
 
 from __future__ import annotations
 
+import asyncio
 import pickle
 import sys
 import traceback
@@ -278,6 +279,17 @@ def replica_is_ending() -> bool:
     """Return whether Serve has begun to stop the replica in this process; Serve has no public hook for that."""
     worker = _worker()
     return bool(worker.actors.get(worker.actor_id)._replica_impl._shutting_down)
+
+
+def replica_is_initialized(replica: Any) -> Any:
+    """Ask a replica's actor whether it has made its callable; Ray before 2.60 does not say, and counts as true.
+
+    Returns:
+        An awaitable of a bool.
+    """
+    if not hasattr(replica, "was_initialized"):
+        return asyncio.sleep(0, result=True)
+    return replica.was_initialized.remote()
 
 
 def replica_request(request_id: str, method: str) -> bytes:

@@ -329,6 +329,17 @@ def local_servers() -> list[LocalServer]:
     return sorted((server for server, _ in _found()), key=lambda server: server.url)
 
 
+def metrics_urls() -> tuple[str, ...]:
+    """Return the URLs at which the nodes of this process's cluster export their metrics."""
+    import ray
+
+    return tuple(
+        f"http://{node['NodeManagerAddress']}:{node['MetricsExportPort']}/metrics"
+        for node in ray.nodes()
+        if node["Alive"]
+    )
+
+
 def _chosen(wanted: str | None) -> tuple[LocalServer, dict[str, str]]:
     """Return the server whose URL or application is `wanted`, and the environment of its Ray's daemon."""
     found = list(_found())

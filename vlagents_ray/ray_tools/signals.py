@@ -36,6 +36,11 @@ def interrupts() -> Iterator[None]:
         _interrupted.clear()
 
 
+def is_interrupted() -> bool:
+    """Return whether Ctrl-C or SIGTERM has arrived within `interrupts`."""
+    return _interrupted.is_set()
+
+
 def raise_dropped_interrupt() -> None:
     """Raise `KeyboardInterrupt` if a signal arrived within `interrupts` and its exception was dropped."""
     if _interrupted.is_set():

@@ -36,7 +36,7 @@ from vlagents_ray.client.credentials import KEY_VARIABLE
 from vlagents_ray.ray_tools.session import FILES
 
 HEAD = "VLAGENTS_RAY_HEAD"  # variable with the address of the first node, exported by the job's script
-_FIRST_PORT, _PORTS, _JOBS = 10_000, 4, 2_500  # below the ports that the package and the system assign
+_FIRST_PORT, _PORTS, _JOBS = 10_000, 5, 2_000  # below the ports that the package and the system assign
 _REST = ("--block", "--disable-usage-stats", "--log-color=false")
 _OBJECTS = 0.25  # share of the memory for Ray's object store, in /dev/shm; Ray's default is 0.3 of the machine's
 _SHORT = "/tmp"  # noqa: S108 - the names of Ray's sockets are limited to 107 bytes
@@ -70,6 +70,13 @@ class Ports:
     client: int  # Ray Client, which cannot be disabled
     metrics: int  # Ray's monitor, which cannot be disabled
     serve: int  # the policy server
+    export: int  # of each node's metrics, which Prometheus scrapes
+
+
+def ports_of(job: int) -> Ports:
+    """Return the ports of a job, the same on all its nodes."""
+    first = _FIRST_PORT + job % _JOBS * _PORTS
+    return Ports(*range(first, first + _PORTS))
 
 
 @dataclass(frozen=True, slots=True)
@@ -101,8 +108,7 @@ class Allocation:
     @property
     def ports(self) -> Ports:
         """The ports of the job, the same on all nodes."""
-        first = _FIRST_PORT + self.job % _JOBS * _PORTS
-        return Ports(*range(first, first + _PORTS))
+        return ports_of(self.job)
 
     def ray_start(self, head: str, folder: str) -> list[str]:
         """Return the command that starts Ray on this node with the allocated resources."""
@@ -117,6 +123,7 @@ class Allocation:
             objects = int(self.memory * _OBJECTS)
             given += [f"--object-store-memory={objects}", f"--memory={self.memory - objects}"]
         # The other listeners use free ports, since Ray's defaults are the same numbers for every cluster.
+        given.append(f"--metrics-export-port={ports.export}")
         free = ["--min-worker-port=0", "--max-worker-port=0", "--dashboard-agent-listen-port=0"]
         return ["ray", "start", *where, *given, *free, f"--temp-dir={folder}/{FILES}", *_REST]
 
@@ -254,13 +261,15 @@ def connection_info(apps: Mapping[str, str], port: int, environ: Mapping[str, st
     url = f"http://{host}:{port}"
     login = environ.get("SLURM_SUBMIT_HOST", host)
     user = environ.get("SLURM_JOB_USER", environ.get("USER", ""))
+    job = int(environ["SLURM_JOB_ID"])
     return {
-        "job": int(environ["SLURM_JOB_ID"]),
+        "job": job,
         "host": host,
         "address": environ[HEAD],
         "port": port,
         "url": url,
         "apps": {name: url + route.rstrip("/") for name, route in apps.items()},
+        "metrics": f"http://{host}:{ports_of(job).export}/metrics",
         "key": environ.get(KEY_VARIABLE) or None,
         "ssh": f"ssh -N -L {port}:{host}:{port} {user}@{login}",
     }

@@ -15,7 +15,7 @@ from vlagents_ray.errors import InvalidInput, InvalidWeights, VLAgentsError
 from vlagents_ray.serve.scaling import sibling_replicas
 from vlagents_ray.serve.scaling.rebalancer import ReplicaLoad
 from vlagents_ray.serve.scaling.session_migration import PeerEnded, PeerUnreachable
-from vlagents_ray.serve.scaling.sibling_replicas import ReplicasInCluster, SiblingReplicas
+from vlagents_ray.serve.scaling.sibling_replicas import PEER_METHODS, ReplicasInCluster, SiblingReplicas
 from vlagents_ray.serve.weights import PushOptions, WeightUpdates
 
 
@@ -40,7 +40,7 @@ def test_errors_of_another_replica(monkeypatch: pytest.MonkeyPatch, error: Excep
         raise error
 
     monkeypatch.setattr(sibling_replicas, "call_replica", call)
-    replica = sibling_replicas._Sibling("r1", "actor")
+    replica = sibling_replicas._Sibling("r1", "actor", {"r1"})
     with pytest.raises(becomes) as found:
         asyncio.run(replica.weights(WeightUpdates.stage, 1, {}, PushOptions()))
     assert type(found.value) is becomes
@@ -58,6 +58,8 @@ class Cluster:
         monkeypatch.setattr(ray, "get_actor", self._actor)
         monkeypatch.setattr(sibling_replicas, "call_replica", self._call)
         monkeypatch.setattr(sibling_replicas, "_SILENT_S", 60.0)
+        self.initialized = set(self.answers)
+        monkeypatch.setattr(sibling_replicas.private, "replica_is_initialized", self._is_initialized)
         context = SimpleNamespace(app_name="app", replica_id=SimpleNamespace(to_full_id_str=lambda: self.name("me")))
         monkeypatch.setattr(serve, "get_replica_context", lambda: context)
 
@@ -69,6 +71,9 @@ class Cluster:
         if name not in self.answers:
             raise ValueError("no such actor")
         return name
+
+    async def _is_initialized(self, actor: str) -> bool:
+        return actor in self.initialized
 
     async def _call(self, actor: str, method: Any, *args: Any) -> Any:
         self.asked.append((actor.rpartition("#")[2], args[0] if args else method.__name__))
@@ -95,6 +100,27 @@ def test_loads_are_those_of_the_replicas_that_answer_and_the_others_are_left_alo
         ("dead", "Rebalancer.load"),
         ("late", "Rebalancer.load"),
     ]
+
+
+def test_a_replica_is_called_once_it_is_initialized(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Serve would log a traceback for a call before; by any method, and again after it was replaced."""
+    cluster = Cluster(monkeypatch, a=load("a"), b=load("b"))
+    cluster.initialized = {cluster.name("a")}
+
+    async def answers(method: Any) -> list[str]:
+        called = [one.call(method) for one in await replicas.others()]
+        found = await asyncio.gather(*called, return_exceptions=True)
+        return ["unreachable" if isinstance(one, PeerUnreachable) else "answered" for one in found]
+
+    replicas = ReplicasInCluster(["app"])
+    methods = [one.call for one in PEER_METHODS.values()]
+    for method in methods:
+        assert asyncio.run(answers(method)) == ["answered", "unreachable"]
+    assert {name for name, _ in cluster.asked} == {"a"}
+    cluster.initialized.add(cluster.name("b"))
+    for method in methods:
+        assert asyncio.run(answers(method)) == ["answered", "answered"]
+    assert len(cluster.asked) == 3 * len(methods)
 
 
 @pytest.mark.parametrize(

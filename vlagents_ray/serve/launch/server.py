@@ -85,6 +85,7 @@ class Server:
 
     url: str  # http(s)://host:port
     apps: Mapping[str, str] = field(default_factory=dict)  # URL of each application
+    metrics: tuple[str, ...] = ()  # URL of the metrics of each node of Ray, for Prometheus
 
 
 @contextlib.contextmanager
@@ -167,7 +168,7 @@ def running_server(
             haproxy.wait_for_haproxy(serve, paths, int(stats_port), deadline)
         if own and ingress:
             session.announce(url, paths, ray.get_runtime_context().gcs_address)
-        yield Server(url, {name: url + path for name, path in paths.items()})
+        yield Server(url, {name: url + path for name, path in paths.items()}, session.metrics_urls())
 
 
 def _access(config: Deployment, keys_file: Path | None, insecure: bool, plain_http: bool) -> Deployment:

@@ -14,6 +14,7 @@ from ray import serve
 
 from vlagents_ray.client.transports.serve_handle import call_replica
 from vlagents_ray.errors import VLAgentsError
+from vlagents_ray.ray_tools import private
 from vlagents_ray.serve.config.deployment import POLICY
 from vlagents_ray.serve.observers.live_view import OtherReplicas, ReplicaView, SnapshotReader
 from vlagents_ray.serve.scaling.rebalancer import Rebalancer, ReplicaLoad
@@ -77,8 +78,9 @@ PEER_METHODS = {
 class _Sibling(Peer):
     """Another replica: for moving sessions, for pushes of weights (`WeightsReplica`), and for the live page."""
 
-    def __init__(self, name: str, actor: Any) -> None:
-        self.name, self._actor = name, actor
+    def __init__(self, name: str, actor: Any, initialized: set[str]) -> None:
+        """`initialized` are the names of the replicas that are known to be; one that answers so is added."""
+        self.name, self._actor, self._initialized = name, actor, initialized
 
     async def ask(
         self, method: Callable[Concatenate[HeldSessions, P], Awaitable[T]], *args: P.args, **kwargs: P.kwargs
@@ -93,6 +95,11 @@ class _Sibling(Peer):
         """Call one of `PEER_METHODS`; raise `PeerEnded`, `PeerUnreachable` or the method's own errors."""
         limit_s = PEER_METHODS[method.__qualname__].limit_s
         try:
+            if self.name not in self._initialized:
+                # Serve answers a request to a replica that is not initialized with a traceback in its log.
+                if not await asyncio.wait_for(private.replica_is_initialized(self._actor), _ANSWER_S):
+                    raise PeerUnreachable("it is not initialized yet")
+                self._initialized.add(self.name)
             asked = call_replica(self._actor, SiblingApi.peer, method.__qualname__, *args)
             return await asyncio.wait_for(asked, limit_s)
         except ray.exceptions.ActorDiedError as error:
@@ -113,10 +120,13 @@ class ReplicasInCluster(OtherReplicas):
         self._apps, self._but = apps, but
         self._views: dict[str, SnapshotReader] = {}  # result of the last lookup
         self._found = float("-inf")
+        self._initialized: set[str] = set()
 
     async def others(self) -> list[_Sibling]:
         """Return the replicas."""
-        return await asyncio.to_thread(lambda: [_Sibling(name, actor) for name, actor in self._actors()])
+        actors = dict(await asyncio.to_thread(lambda: list(self._actors())))
+        self._initialized &= actors.keys()  # without those that have ended
+        return [_Sibling(name, actor, self._initialized) for name, actor in actors.items()]
 
     async def views(self) -> dict[str, SnapshotReader]:
         """Return the readers of the replicas' snapshots, by name."""

@@ -1,0 +1,50 @@
+"""A server with two replicas starts and stops without a word of an error, and prints where its metrics are."""
+
+from __future__ import annotations
+
+import os
+import re
+import signal
+import subprocess
+import sys
+import urllib.request
+from pathlib import Path
+
+import pytest
+import yaml
+from eval_fakes import wait_for
+from ray_processes import START_S, free_address
+
+from vlagents_ray.serve.launch.deployment_file import IMPORT_PATH
+
+pytestmark = [pytest.mark.server, pytest.mark.slow]
+SERIES = "ray_vlagents_sessions"
+
+
+@pytest.mark.parametrize("to_the_group", [True, False], ids=["group", "process"])
+def test_two_replicas_start_and_stop_in_silence(to_the_group: bool, tmp_path: Path) -> None:
+    application = {"import_path": IMPORT_PATH, "args": {"policy": "noop", "replicas": 2}}
+    (tmp_path / "two.yaml").write_text(yaml.safe_dump({"applications": [application]}))
+    port = free_address().rpartition(":")[2]
+    command = [sys.executable, "-c", "from vlagents_ray.cli import main; main()", "serve", "two.yaml", "--port", port]
+    log = tmp_path / "log"
+    with log.open("w") as output:
+        server = subprocess.Popen(command, stdout=output, stderr=output, cwd=tmp_path, start_new_session=True)
+    try:
+        wait_for(lambda: server.poll() is not None or "Ctrl-C stops" in log.read_text(), START_S)
+        assert server.poll() is None, log.read_text()
+        [url] = re.findall(r"^metrics for Prometheus: (http://\S+)$", log.read_text(), re.MULTILINE)
+        wait_for(lambda: SERIES in metrics(url), START_S)
+    finally:
+        (os.killpg if to_the_group else os.kill)(server.pid, signal.SIGTERM)
+        server.wait(START_S)
+    printed = log.read_text()
+    assert server.returncode == 0, printed
+    expected = r"serving|  policy|  API|  live page|metrics|in a Ray program|log of Ray|Ctrl-C stops"
+    assert [line for line in printed.splitlines() if not re.match(expected, line)] == []
+
+
+def metrics(url: str) -> str:
+    with urllib.request.urlopen(url, timeout=10) as answer:
+        text: str = answer.read().decode()
+    return text
