@@ -34,6 +34,8 @@ class Adapter:
     checkouts: tuple[str, ...] = ()  # variables, one of which names a checkout of the authors' code
     wants: str = ""  # further requirements of its users, such as "assets"
     tasks: str = "/<task>"  # of an environment: the pattern after its name
+    deployment: str | None = None  # file of deployments/ with its settings; None: its own name
+    weights: bool = False  # whether a checkout has weights of it, which deployments/NAME.yaml names
     page: str | None = None  # below docs/policies or docs/benchmarks, "page#section"; "": none; None: its own name
 
 
@@ -51,6 +53,7 @@ POLICIES: dict[str, Adapter] = {
         needs=("gr00t", "transformers", "torch", "diffusers"),
         requirements=("gr00t", "lerobot06"),
         checkouts=("GR00T_SRC",),
+        deployment="isaac_gr00t",
     ),
     "pi0": Adapter(
         "vlagents_ray.policies.pi0:Pi0",
@@ -64,6 +67,7 @@ POLICIES: dict[str, Adapter] = {
         needs=("openpi", "jax", "flax", "transformers", "torch"),
         requirements=("openpi",),
         checkouts=("OPENPI_SRC",),
+        deployment="pi05",
         page="pi0#openpi",
     ),
     "openvla": Adapter(
@@ -116,6 +120,7 @@ POLICIES: dict[str, Adapter] = {
         "vlagents_ray.policies.reference:Reference",
         "the reference policy: 4 million parameters, two cameras and words; trained on two cores",
         wants="torch",
+        weights=True,
     ),
     "upstream": Adapter(
         "vlagents_ray.policies.upstream:Upstream",

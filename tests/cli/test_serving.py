@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import re
 import stat
 import threading
 from pathlib import Path
@@ -11,12 +12,16 @@ from types import SimpleNamespace
 import pytest
 from eval_fakes import wait_for
 
+import vlagents_ray
 from vlagents_ray.cli import ray_session
 from vlagents_ray.cli.ray_session import quiet_ray
 from vlagents_ray.cli.serve import connection_lines
 from vlagents_ray.errors import ConfigError
-from vlagents_ray.serve.launch.deployment_file import deployment, with_gateways_at
+from vlagents_ray.registry import POLICIES, policy_class
+from vlagents_ray.serve.launch import deployment_file
+from vlagents_ray.serve.launch.deployment_file import deployment, own_settings, read_deployment, with_gateways_at
 from vlagents_ray.serve.ports import EVERYWHERE
+from vlagents_ray.yaml_text import read_yaml
 
 INFO = "INFO 2026-11-21 17:02:51,406 proxy 127.0.0.1 -- HAProxy starting on node 321f (HTTP port: 8977)."
 MEANT = "WARNING 2026-11-21 17:02:48,881 controller 3438 -- HTTPOptions.host='127.0.0.1' won't accept connections from HAProxy on other nodes; cross-node routing will fail"  # fmt: skip  # noqa: E501
@@ -166,3 +171,42 @@ def test_the_page_of_a_server_with_keys_is_asked_for_with_one(tmp_path: Path) ->
     elsewhere = deployment("noop", access={"keys_file": "/on/the/cluster/keys.json"})
     assert page in connection_lines(elsewhere, urls, "127.0.0.1")
     assert page not in connection_lines(elsewhere, urls, "127.0.0.1", insecure=True)
+
+
+def _needing_settings() -> list[str]:
+    configs = {name: getattr(policy_class(name).Config, "model_fields", {}) for name in POLICIES}
+    return [name for name, fields in configs.items() if any(field.is_required() for field in fields.values())]
+
+
+@pytest.mark.parametrize("policy", _needing_settings())
+def test_a_policy_that_lacks_a_setting_names_a_file_and_a_page_that_have_it(
+    policy: str, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(deployment_file, "_settings_of_checkout", lambda _policy: {})
+    with pytest.raises(ConfigError) as raised:
+        read_deployment(policy)
+    checkout = Path(vlagents_ray.__file__).parents[1]
+    [file] = re.findall(r"deployments/\w+\.yaml", str(raised.value))
+    [page] = re.findall(r"docs/policies/\w+\.md", str(raised.value))
+    assert "is missing; give --set" in str(raised.value)
+    assert read_yaml(checkout / file)["applications"][0]["args"]["policy"] == policy
+    assert policy in (checkout / page).read_text()
+
+
+@pytest.mark.parametrize("inside", [True, False], ids=["in the checkout", "elsewhere"])
+def test_a_policy_whose_weights_a_checkout_has_is_served_by_its_name(
+    inside: bool, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    checkout = Path(vlagents_ray.__file__).parents[1]
+    monkeypatch.chdir(checkout if inside else tmp_path)
+    of_name = own_settings(read_deployment("reference").applications[0])
+    monkeypatch.chdir(checkout)
+    of_file = own_settings(read_deployment("deployments/reference.yaml").applications[0])
+    assert Path(of_name["checkpoint"]).samefile(of_file["checkpoint"])
+    assert of_name == of_file | {"checkpoint": of_name["checkpoint"]}
+    changed = read_deployment("reference", {"config": {"execute": 2}})
+    assert own_settings(changed.applications[0]) == of_file | {"execute": 2}
+    monkeypatch.setattr(deployment_file, "POLICIES", {})
+    with pytest.raises(ConfigError, match="is missing"):
+        read_deployment("reference")

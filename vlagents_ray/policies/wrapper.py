@@ -9,7 +9,7 @@ from vlagents_ray.contract import Contract
 from vlagents_ray.errors import ConfigError, UnknownPolicy
 from vlagents_ray.interface import Act, Agent, Obs
 from vlagents_ray.policies.outcomes import of_good
-from vlagents_ray.registry import policy_class, wrapper_class
+from vlagents_ray.registry import POLICIES, policy_class, wrapper_class
 from vlagents_ray.settings import wrong_settings
 
 
@@ -108,7 +108,10 @@ def build_agent(
     """
     if not issubclass(kind := policy_class(policy), Agent):
         raise UnknownPolicy(f"policy {policy!r}: is no Agent; derive the class from vlagents_ray.Agent")
-    agent: Agent = kind.from_config(config)
+    try:
+        agent: Agent = kind.from_config(config)
+    except ConfigError as error:
+        raise ConfigError(f"{error}{_example_of(policy, kind, config)}") from error
     for entry in reversed(wrappers):
         named = {entry: {}} if isinstance(entry, str) else dict(entry)
         if len(named) != 1:
@@ -119,6 +122,18 @@ def build_agent(
             raise ConfigError(f"wrappers: {name!r} is {cls.__name__}, want a subclass of {Wrapper.__module__}.Wrapper")
         agent = cls.around(agent, settings or {})
     return agent
+
+
+def _example_of(policy: str, kind: type[Agent], config: Mapping[str, Any]) -> str:
+    """Return the end of a message that names a file and a page with the settings that `config` lacks, if any."""
+    fields = getattr(kind.Config, "model_fields", {})
+    missing = any(field.is_required() and name not in config for name, field in fields.items())
+    if not missing or policy not in POLICIES:
+        return ""
+    adapter = POLICIES[policy]
+    page, _, section = (policy if adapter.page is None else adapter.page).partition("#")
+    where = f"docs/policies/{page}.md" + (f"#{section}" if section else "")
+    return f". deployments/{adapter.deployment or policy}.yaml of a checkout has an example, and {where} explains it"
 
 
 def unloaded_contract(agent: Agent) -> Contract | None:

@@ -9,13 +9,14 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from pydantic import BaseModel, Field, ValidationError
 
+import vlagents_ray
 from vlagents_ray.contract import Contract
 from vlagents_ray.errors import ConfigError, UnknownPolicy
 from vlagents_ray.naming import did_you_mean
 from vlagents_ray.policies.base.checkpoint import STEP as STEP_PLACE
 from vlagents_ray.policies.wrapper import build_agent, unloaded_contract
 from vlagents_ray.ray_tools.runtime_env import require_no_secrets
-from vlagents_ray.registry import names, policy_class
+from vlagents_ray.registry import POLICIES, names, policy_class
 from vlagents_ray.serve.config.deployment import POLICY, ServerArgs
 from vlagents_ray.serve.models.checkpoints import CHOICE, STEP, Checkpoints
 from vlagents_ray.serve.ports import LOOPBACK
@@ -105,7 +106,20 @@ def read_deployment(
                 f"family, as in deployments/lerobot.yaml --set checkpoint={source}"
             )
         policy_class(source)  # raises an error with the list of choices
-    return deployment(source, step_follows=step_follows, **(overrides or {}))
+    args = dict(overrides or {})
+    if source in POLICIES and POLICIES[source].weights and "checkpoint" not in args.get("config", {}):
+        args["config"] = _settings_of_checkout(source) | args.get("config", {})
+    return deployment(source, step_follows=step_follows, **args)
+
+
+def _settings_of_checkout(policy: str) -> dict[str, Any]:
+    """Return the settings in the deployment file of a checkout that has this policy's weights; empty without one."""
+    for folder in (Path(), Path(vlagents_ray.__file__).parents[1]):
+        file = folder / "deployments" / f"{policy}.yaml"
+        if file.is_file():
+            settings: dict[str, Any] = read_yaml(file)["applications"][0]["args"]["config"]
+            return settings | {"checkpoint": str(folder / settings["checkpoint"])}
+    return {}
 
 
 def policy_application(source: str, app: str | None = None) -> Application:
