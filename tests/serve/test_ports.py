@@ -83,6 +83,26 @@ def test_two_processes_are_given_different_ports(monkeypatch: pytest.MonkeyPatch
     assert not theirs & ours
 
 
+@pytest.mark.usefixtures("claims")
+@pytest.mark.skipif(os.getuid() != 0, reason="another account is needed, which only root can act as")
+@pytest.mark.parametrize("listens", ["", "s.listen(0);"], ids=["bound", "listening"])
+def test_another_account_cannot_claim_all_ports(listens: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    few = free_range(12)
+    squat = (
+        "import os, socket, sys; os.setgroups([]); os.setgid(65534); os.setuid(65534); held = []\n"
+        f"for port in range(*{few}):\n"
+        f"    s = socket.socket(socket.AF_UNIX); s.bind(f'\\0vlagents-ray-port-{{port}}'); {listens} held.append(s)\n"
+        "print('bound', flush=True); sys.stdin.read()"
+    )
+    with subprocess.Popen([sys.executable, "-c", squat], stdin=subprocess.PIPE, stdout=subprocess.PIPE) as other:
+        assert other.stdin is not None
+        assert other.stdout.readline() == b"bound\n"
+        monkeypatch.setattr(ports, "_PORTS", few)
+        drawn = [free_port() for _ in range(5)]
+        other.stdin.close()
+    assert set(drawn) <= set(range(*few))
+
+
 def test_haproxy_alone_faces_the_network(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     front = PublicListener("192.0.2.7", 8000, inside=8001)
     for key, value in ingress_environment(tmp_path, "/bin/true", front).items():

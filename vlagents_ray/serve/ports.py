@@ -9,6 +9,7 @@ import time
 from collections import deque
 
 from vlagents_ray.errors import ConfigError
+from vlagents_ray.protocol.messages import peer_uid
 
 LOOPBACK, EVERYWHERE = "127.0.0.1", "0.0.0.0"  # noqa: S104 - only compared, and bound for a moment
 HOST = "VLAGENTS_RAY_HOST"  # environment variable of a replica: the address of its server, if it is not Serve's
@@ -16,6 +17,8 @@ _BLOCKS = (20_000, 24_000)  # range of the ports for replicas
 _PORTS = (24_000, 32_700)  # range of the ports for HAProxy and others, below the system's ephemeral ports
 _CLAIMS = 256  # maximum number of ports that this process claims at once, the latest ones
 _RELEASE_S = 2.0  # time limit for a server that is being replaced to close its port
+_PROBES = 64  # processes that may read whose a claim is
+_LISTEN_S = 0.002  # time for a process that has just bound its claim to listen, too
 _claims: deque[int] = deque()  # descriptors of the claims; the kernel closes them with the process
 _kept: set[int] = set()  # ports that `free_port` never returns
 _random = random.SystemRandom()
@@ -37,21 +40,37 @@ def free_port(host: str = LOOPBACK) -> int:
 
 
 def _claim(port: int) -> bool:
-    """Claim a port for this process; False if it is claimed already.
+    """Claim a port for this process; False if another process of this user has claimed it.
 
     The claim is an abstract Unix socket named after the port, which the kernel lets only one process bind, and closes
-    when that process ends.
+    when that process ends. Any account of the machine can bind such names, so claims of other users do not count: they
+    could otherwise claim all ports, and no server of this user would start.
     """
+    name = f"\0vlagents-ray-port-{port}"
     claim = socket.socket(socket.AF_UNIX)
     try:
-        claim.bind(f"\0vlagents-ray-port-{port}")
+        claim.bind(name)
     except OSError:
         claim.close()
-        return False
+        return not _is_claim_of_this_user(name)
+    claim.listen(_PROBES)  # so that others can read whose it is
     _claims.append(claim.detach())
     if len(_claims) > _CLAIMS:
         os.close(_claims.popleft())
     return True
+
+
+def _is_claim_of_this_user(name: str) -> bool:
+    for _ in range(2):
+        with socket.socket(socket.AF_UNIX) as probe:
+            probe.setblocking(False)
+            try:
+                probe.connect(name)
+            except OSError:
+                time.sleep(_LISTEN_S)
+            else:
+                return peer_uid(probe) == os.getuid()
+    return False
 
 
 def keep(*ports: int) -> None:
