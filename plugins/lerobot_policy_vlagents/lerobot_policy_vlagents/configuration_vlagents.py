@@ -32,6 +32,7 @@ class VlagentsConfig(PreTrainedConfig):
     transport: str = "auto"  # as of `RemoteAgent`
     codec: str = "auto"  # of images, as of `RemoteAgent`: "jpeg", "lossless", "raw", …
     rank: str = "robot"  # "simulation": robots of the same server go first
+    accept_misfit: bool = False  # move a robot although the training's statistics do not fit it; the log shows it
     timeout_s: float = 30.0  # for a request; after it the command ends with an error
     connect_timeout_s: float = 60.0  # for a server that is still loading
     device: str | None = "cpu"  # of observations until they are sent

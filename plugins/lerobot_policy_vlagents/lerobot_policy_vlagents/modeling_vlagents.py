@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import logging
 import threading
 from collections import deque
@@ -24,6 +25,7 @@ from lerobot_policy_vlagents.observations import (
 from vlagents_ray import Act, Obs, RemoteAgent
 from vlagents_ray.errors import ConfigError, ContractMismatch, InvalidAction
 from vlagents_ray.interface import DELAY, LEFTOVER
+from vlagents_ray.robot.fit import Fit, Trained
 
 _GUIDANCE = ("max_guidance_weight", "prefix_attention_schedule")  # of RTCConfig; the server has its own
 logger = logging.getLogger(__name__)
@@ -152,6 +154,7 @@ class _Robot:
         self.config = config
         features = {} if dataset_meta is None else dataset_meta.features
         self.names = _names(features.get("observation.state", {}).get("names"))
+        self.action_names = _names(features.get("action", {}).get("names"))
         self.hz = None if dataset_meta is None else float(dataset_meta.fps)
         action = config.action_feature
         self.action_dim = None if action is None else int(action.shape[0])
@@ -191,8 +194,15 @@ class _Robot:
     def mapping(self, agent: RemoteAgent, shapes: Mapping[str, Sequence[int]]) -> ObservationMapping:
         """Return the mapping of observations of these shapes to the policy's; raises `ContractMismatch`."""
         found = ObservationMapping(self.config, agent.contract, shapes, self.names)
-        require_fit(agent.contract, found.contract(self.action_dim, self.hz))
+        require_fit(agent.contract, found.contract(self.action_dim, self.hz, self.action_names))
         return found
+
+    def fit(self, agent: RemoteAgent, mapping: ObservationMapping) -> Fit:
+        """Return the comparison of the policy's numbers with the robot's; an environment is not compared."""
+        statistics = agent.statistics if self.config.rank == "robot" else None
+        trained, parts = Trained.from_statistics(statistics or {}), [*itertools.chain(*mapping.parts.values())]
+        names = tuple(part for part, _ in parts)
+        return Fit(trained, None, tuple(self.action_names), names, self.config.accept_misfit)
 
 
 class _Sessions:
@@ -204,6 +214,7 @@ class _Sessions:
         self._agents: list[RemoteAgent] = []
         self._rows: list[deque[np.ndarray]] = []
         self._mapping: ObservationMapping | None = None  # None before the first episodes
+        self._fit: Fit | None = None  # of the next chunks with the robot; None once they were compared
         self._due = True  # whether the next batch begins episodes
         self._begun = 0  # episodes so far
 
@@ -249,6 +260,9 @@ class _Sessions:
         seeds = None if self._config.seed is None else [self._config.seed + self._begun + row for row in range(size)]
         options: dict[str, Any] = {} if self._config.checkpoint is None else {"checkpoint": self._config.checkpoint}
         observations = [mapping.observation(batch, row) for row in range(size)]
+        self._fit = fit = self._robot.fit(self.agent, mapping)
+        for obs in observations:
+            fit.require(obs, None)
         _successes(self.agent.reset_batch(observations, tasks, self._agents, seeds=seeds, **options))
         self._begun += size
         self._rows = [deque() for _ in range(size)]
@@ -268,6 +282,10 @@ class _Sessions:
             raise ContractMismatch(
                 f"action: got {odd[0]} numbers a row from the server, want {want} here; is this another robot's policy?"
             )
+        if self._fit is not None:
+            for chunk in chunks:
+                self._fit.require(None, chunk)
+            self._fit = None
         return chunks
 
     def _instructions(self, batch: Mapping[str, Any], size: int) -> list[str | None]:

@@ -56,7 +56,7 @@ class ObservationMapping:
         self._cameras_here = known
         self.parts = _parts(config, policy, {key: shapes[key][0] for key in _STATES if key in shapes}, names)
 
-    def contract(self, action_dim: int | None, control_hz: float | None) -> Contract:
+    def contract(self, action_dim: int | None, control_hz: float | None, action_names: Sequence[str] = ()) -> Contract:
         """Return the contract of the robot or the environment, as far as LeRobot states it."""
         sizes = {name: self._shapes[key][1:] for name, key in self._cameras_here.items()}
         listed = [part for parts in self.parts.values() for part in parts]
@@ -64,7 +64,7 @@ class ObservationMapping:
             cameras={name: CameraSpec(height, width) for name, (height, width) in sizes.items()},
             state={part: StateSpec(dim) for part, dim in listed if part != "gripper"},
             gripper=any(part == "gripper" for part, _ in listed),
-            action=ActionSpec(dim=action_dim),
+            action=ActionSpec(dim=action_dim, names=tuple(action_names) or None),
             control_hz=control_hz,
         )
 

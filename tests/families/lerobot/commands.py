@@ -51,6 +51,8 @@ def serving(policy: Agent) -> Iterator[Server]:
     key = known.add("robot")
     metadata = {"contract": policy.contract.to_json() if policy.contract else None, "version": "0"}
     metadata |= {"policy": type(policy).__name__, "protocol": PROTOCOL_VERSION}
+    if policy.statistics is not None:
+        metadata["weights"] = {"statistics": policy.statistics}
 
     def describe() -> dict[str, object]:
         return metadata | {"continues_plans": engine.models.continues_plans}

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import count
 from pathlib import Path
 from typing import Any
@@ -239,3 +239,49 @@ def test_a_policy_without_features_learns_them_from_the_first_observation(server
     made.reset()
     with pytest.raises(ContractMismatch, match="camera 'top': the policy needs it"):
         made.select_action({key: value for key, value in batch(5).items() if "top" not in key})
+
+
+class Trained(MirrorPolicy):
+    """A policy that declares the ranges of its training."""
+
+    def __init__(self, part: str, low: float, high: float) -> None:
+        super().__init__()
+        self.statistics = {"parts": ["joints", "gripper"], part: {"min": [low] * 3, "max": [high] * 3}}
+
+
+@pytest.mark.parametrize(
+    ("part", "low", "high", "said"),
+    [
+        ("observation.state", 0.0, 10.0, None),
+        ("observation.state", 0.0, 1.0, r"state\[0\].*: got 9, was trained from 0 to 1"),
+        ("action", 1000.0, 1001.0, r"first chunk\[0\].*was trained from 1000 to 1001"),
+    ],
+)
+def test_a_robot_outside_of_the_training_is_found_before_the_first_motion(
+    monkeypatch: pytest.MonkeyPatch, part: str, low: float, high: float, said: str | None
+) -> None:
+    with serving(Trained(part, low, high)) as server:
+        monkeypatch.setenv("VLAGENTS_RAY_API_KEY", server.key)
+
+        def act(**options: Any) -> None:
+            config = VlagentsConfig(url=server.url, state=["joints", "gripper"], connect_timeout_s=20, **options)
+            make_policy(config, env_cfg=MirrorEnvConfig()).select_action(batch(9))
+
+        if said is None:
+            act()
+            return
+        with pytest.raises(ContractMismatch, match=said):
+            act()
+        act(accept_misfit=True)
+        act(rank="simulation")
+
+
+def test_joints_in_another_order_than_that_of_the_policy_are_found_by_name() -> None:
+    shapes = {"observation.images.top": (3, SIDE, SIDE), "observation.state": (3,)}
+    names = ["joints_0", "joints_1", "gripper"]
+    here = ObservationMapping(VlagentsConfig(), CONTRACT, shapes, names).contract(
+        3, 20.0, ["b.pos", "a.pos", "gripper.pos"]
+    )
+    trained = replace(CONTRACT, action=replace(CONTRACT.action, names=("a", "b", "gripper")))
+    [first, _] = [line for line in differences(trained, here) if "action.names" in line]
+    assert "number 0 is 'a' of the policy and 'b' of the env" in first
