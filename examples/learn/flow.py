@@ -24,12 +24,13 @@ import torch
 import typer
 from grpo import group_advantages
 from learner import advantages, episodes, until_solved
-from pydantic import BaseModel, ConfigDict, NonNegativeInt, PositiveInt
+from pydantic import BaseModel, ConfigDict
 
 from vlagents_ray import Obs
 from vlagents_ray.cli.console import errors
 from vlagents_ray.cli.ray_session import quiet_ray
 from vlagents_ray.evaluate import EvalConfig, Results, compare
+from vlagents_ray.evaluate.plan.config import Count, Retries, Seed
 from vlagents_ray.learn import Publisher, RolloutPlan, Rollouts, TrainingEvaluation, answers, arrays, log_ratio
 from vlagents_ray.policies.base.model_inputs import state_vector
 from vlagents_ray.policies.flow import logprob_of_chain
@@ -75,14 +76,14 @@ class FlowPlan(BaseModel):
 
     method: Method
     out: Path
-    seed: NonNegativeInt = 0
-    iterations: PositiveInt = 20
-    episodes: PositiveInt = 512  # of an iteration
-    groups: PositiveInt = 8  # episodes from one start state, in "grpo"
-    epochs: PositiveInt = 2  # times that an iteration learns from each act
-    max_lag: NonNegativeInt | None = None  # versions; None: episodes and learner wait for each other
-    evaluate_every: PositiveInt = 5  # iterations
-    held_out: PositiveInt = 500  # episodes of an evaluation, the same for each version
+    seed: Seed = 0
+    iterations: Count = 20
+    episodes: Count = 512  # of an iteration
+    groups: Count = 8  # episodes from one start state, in "grpo"
+    epochs: Count = 2  # times that an iteration learns from each act
+    max_lag: Retries | None = None  # versions; None: episodes and learner wait for each other
+    evaluate_every: Count = 5  # iterations
+    held_out: Count = 500  # episodes of an evaluation, the same for each version
 
 
 class Learned(NamedTuple):
@@ -296,14 +297,14 @@ def learn(
     torch.set_num_threads(1)  # its networks are small
     settings = {"iterations": iterations, "episodes": episodes, "held_out": held_out, "evaluate_every": evaluate_every}
     run = {"method": method, "out": out, "seed": seed, "max_lag": max_lag}
-    with errors():
+    with errors(FlowPlan):
         FlowRun(FlowPlan.model_validate(settings | run)).learn()
 
 
 @app.command("compare")
 def compare_runs(folders: Annotated[list[Path], typer.Argument(help="Of runs with different seeds.")]) -> None:
     """Compare each run's first and last version on the same seeds, by McNemar's exact test."""
-    with errors():
+    with errors(FlowPlan):
         for ticks in (SHORT, LONG):
             gains = []
             for folder in folders:

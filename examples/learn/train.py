@@ -20,7 +20,7 @@ import torch
 import typer
 from grpo import GRPOLearner
 from learner import NetworkLearner, PPOLearner, RPDLearner, advice, episodes, inputs_of
-from pydantic import BaseModel, ConfigDict, Field, NonNegativeInt, PositiveInt
+from pydantic import BaseModel, ConfigDict, Field
 
 from vlagents_ray.cli.console import errors, out
 from vlagents_ray.cli.options import parse_list, read_run_file
@@ -28,6 +28,7 @@ from vlagents_ray.cli.ray_session import quiet_ray
 from vlagents_ray.client import RemoteAgent
 from vlagents_ray.errors import ConfigError, PolicyUnavailable, WeightsLost
 from vlagents_ray.evaluate import EvalConfig, PolicyConfig, SuiteConfig, Summary, print_summary
+from vlagents_ray.evaluate.plan.config import Count, Seed
 from vlagents_ray.learn import Publisher, RolloutPlan, Rollouts, TrainingEvaluation, arrays
 from vlagents_ray.serve.launch.deployment_file import deployment, together
 from vlagents_ray.serve.launch.server import running_server
@@ -51,17 +52,17 @@ class LearnPlan(BaseModel):
     methods: list[Method] = Field(default=["bc", "rpd", "ppo"], min_length=1)
     out: Path = Path("runs/learn")
     resume: bool = False  # continue an interrupted or killed run
-    seed: NonNegativeInt = 0  # of the networks, and of the training's episodes
-    demonstrations: PositiveInt = 48  # episodes of the teacher
-    clone_steps: PositiveInt = 2000  # of the optimizer
-    iterations: PositiveInt = 10  # of each method
-    episodes: PositiveInt = 32  # of the student in each iteration
-    groups: PositiveInt = 8  # episodes from one start state, in "grpo"
-    steps: PositiveInt | None = None  # of the optimizer in each iteration; default: rpd 500, ppo 40, grpo 20
-    evaluate_every: PositiveInt = 5  # iterations
-    held_out: PositiveInt = 200  # episodes of an evaluation, the same for each version
-    workers: PositiveInt = 2
-    num_envs: PositiveInt = 16  # environments of a worker
+    seed: Seed = 0  # of the networks, and of the training's episodes
+    demonstrations: Count = 48  # episodes of the teacher
+    clone_steps: Count = 2000  # of the optimizer
+    iterations: Count = 10  # of each method
+    episodes: Count = 32  # of the student in each iteration
+    groups: Count = 8  # episodes from one start state, in "grpo"
+    steps: Count | None = None  # of the optimizer in each iteration; default: rpd 500, ppo 40, grpo 20
+    evaluate_every: Count = 5  # iterations
+    held_out: Count = 200  # episodes of an evaluation, the same for each version
+    workers: Count = 2
+    num_envs: Count = 16  # environments of a worker
     track: list[str] = []  # trackers that show success rates beside `out`, against the optimizer's steps
 
 
@@ -272,7 +273,7 @@ def main(
 ) -> None:
     """Train a small policy to lift pucks: from demonstrations, with a teacher's advice, and alone."""
     given = {"out": out_dir, "seed": seed, "resume": resume or None, "track": parse_list(track) or None}
-    with errors():
+    with errors(LearnPlan):
         settings = {} if file is None else read_run_file(file, "file of settings", "`methods`")
         settings |= {name: value for name, value in given.items() if value is not None}
         with quiet_ray(None):

@@ -16,6 +16,7 @@ from typer.testing import CliRunner
 
 from vlagents_ray import Obs, RemoteAgent
 from vlagents_ray.cli.main import app
+from vlagents_ray.cli.new import as_typed
 from vlagents_ray.policies.noop import Noop
 
 KINDS = ["policy", "env", "dialect"]
@@ -40,6 +41,42 @@ def test_a_skeleton_passes_its_own_test(kind: str, folder: Path) -> None:
     command = [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", "test_my_own.py"]
     done = subprocess.run(command, check=False, cwd=folder, env=ENV, capture_output=True, text=True, timeout=300)
     assert done.returncode == 0, done.stdout + done.stderr
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", KINDS)
+def test_the_next_steps_run_as_they_are_printed_and_without_pytest(kind: str, folder: Path) -> None:
+    """In the environment of `make demo`, which has no pytest; those that serve are tested below."""
+    status, printed = new(kind, "my_own")
+    assert status == 0
+    (folder / "absent").mkdir()
+    (folder / "absent" / "pytest.py").write_text("raise ImportError('pytest is not installed')")
+    environment = ENV | {"PYTHONPATH": f"{folder / 'absent'}:{ENV.get('PYTHONPATH', '')}"}
+    steps = [line.partition("   ")[0] for line in printed.splitlines()[1:]]
+    assert any(" test_my_own.py" in step for step in steps)
+    ran = [step for step in steps if " serve " not in step and not step.startswith("curl")]
+    assert len(ran) == {"policy": 2, "env": 2, "dialect": 1}[kind]
+    for step in ran:
+        done = subprocess.run(
+            ["sh", "-c", step], check=False, cwd=folder, env=environment, capture_output=True, text=True, timeout=300
+        )
+        assert done.returncode == 0, step + done.stdout + done.stderr
+    assert (folder / "runs").exists() == (kind != "dialect")
+
+
+@pytest.mark.parametrize(("on_path", "typed"), [(True, "python"), (False, "venv/bin/python")])
+def test_a_program_is_named_as_the_shell_finds_it(
+    on_path: bool, typed: str, folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    program = folder / "venv" / "bin" / "python"
+    program.parent.mkdir(parents=True)
+    program.touch(0o755)
+    monkeypatch.setattr(sys, "executable", str(program.with_name("python3")))
+    monkeypatch.setenv("PATH", str(program.parent) if on_path else "/usr/bin")
+    assert as_typed("python") == typed
+    (folder / "inner").mkdir()
+    monkeypatch.chdir(folder / "inner")
+    assert as_typed("python") == ("python" if on_path else str(program))
 
 
 @pytest.mark.server
@@ -77,7 +114,7 @@ def test_what_is_there_stays_and_nothing_is_written_beside_it(kind: str, folder:
         assert [(path.name, path.read_text()) for path in folder.iterdir()] == [(there, "years of work")]
         (folder / there).unlink()
     said = new(kind, "mine")[1]
-    assert "pytest test_mine.py" in said
+    assert "test_mine.py" in said
     assert f"vlagents-ray {'eval' if kind == 'env' else 'serve'} mine.yaml" in said
 
 

@@ -30,6 +30,7 @@ def test_a_page_stands_beside_its_results_and_one_of_several_folders_where_it_is
     assert done.exit_code == 0, done.output
     assert done.stdout.strip() == f"report: {tmp_path / 'a' / 'report.html'}"
     assert (tmp_path / "a" / "report.html").read_text().startswith("<!doctype html>")
+    (tmp_path / "pages").mkdir()
     words = [str(tmp_path / "a"), str(tmp_path / "b"), "--inline"]
     assert report(*words, "--out", str(tmp_path / "pages" / "both.html")).exit_code == 0
     page = (tmp_path / "pages" / "both.html").read_text()

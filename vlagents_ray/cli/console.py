@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any, NoReturn
 
 import typer
-from pydantic import ValidationError
+from pydantic import BaseModel, ValidationError
 from rich.console import Console, ConsoleDimensions, ConsoleOptions, RenderableType
 from rich.segment import Segment
 from rich.table import Table
@@ -63,10 +63,13 @@ err = PlainConsole(stderr=True)
 
 
 @contextlib.contextmanager
-def errors() -> Iterator[None]:
+def errors(*settings: type[BaseModel]) -> Iterator[None]:
     """Print errors of this package as one message on stderr: exit code 1, 2 for wrong settings, 130 for Ctrl-C.
 
     SIGTERM is treated as Ctrl-C, so that started processes end in order.
+
+    Args:
+        settings: Further models of settings that a user writes, whose fields the message lists for an unknown one.
     """
     try:
         with interrupts():
@@ -75,7 +78,8 @@ def errors() -> Iterator[None]:
         from vlagents_ray.evaluate import EvalConfig
         from vlagents_ray.evaluate.exports.scores import HubSettings
 
-        models = {EvalConfig: None, HubSettings: "--hub-set"}  # that users write, and the options that set their fields
+        # The models that users write, and the options that set their fields.
+        models = {EvalConfig: None, HubSettings: "--hub-set"} | dict.fromkeys(settings)
         known = next(((one, option) for one, option in models.items() if one.__name__ == error.title), (None, None))
         fail(f"wrong settings: {wrong_settings(error, *known)}", 2)
     except ConfigError as error:
@@ -101,6 +105,14 @@ def say_error(message: str, console: Console | None = None) -> None:
     """Print an error after all other output."""
     sys.stdout.flush()
     (console or err).print(Text.assemble(("error", "bold red"), f" {message}"))
+
+
+def require_folder_of(file: Path) -> None:
+    """Raise `ConfigError` unless the folder of a file that a command is about to write exists."""
+    if not file.absolute().parent.is_dir():
+        raise ConfigError(
+            f"{file}: expected a file in a folder that exists, got no folder {file.parent}; make it first"
+        )
 
 
 def fresh(folder: Path) -> Path:

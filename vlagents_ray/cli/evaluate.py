@@ -244,6 +244,13 @@ def config_from_options(options: EvalOptions) -> EvalConfig:
         fields["robot"] = {**(fields.get("robot") or {}), "arm": options.arm}
     config = EvalConfig.model_validate(fields)
 
+    for one in config.policies:
+        if one.source is not None and one.url is not None:
+            raise ConfigError(
+                f"policy {one.name!r}: expected `source`, a policy to serve, or the `url` of a server, got both; "
+                f"leave one of them out"
+            )
+
     def filled(of: WorkerConfig) -> WorkerConfig:  # with the resources that are not in the configuration
         return of.model_copy(update={name: value for name, value in worker.items() if name not in of.model_fields_set})
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib.metadata
 import json
 from collections.abc import Sequence
 from dataclasses import asdict
@@ -30,8 +31,25 @@ app = typer.Typer(
     no_args_is_help=True,
     add_completion=False,
     pretty_exceptions_enable=False,
-    help="Serve Vision-Language-Action models with Ray, and evaluate them in parallel simulation.",
+    context_settings={"help_option_names": ["--help", "-h"]},
 )
+
+
+def _print_version(wanted: bool) -> None:
+    if wanted:
+        out.print(f"vlagents-ray {importlib.metadata.version('vlagents-ray')}")
+        raise typer.Exit
+
+
+@app.callback()
+def commands(
+    version: Annotated[
+        bool, typer.Option("--version", is_eager=True, callback=_print_version, help="Print the version.")
+    ] = False,
+) -> None:
+    """Serve Vision-Language-Action models with Ray, and evaluate them in parallel simulation."""
+
+
 env = typer.Typer(no_args_is_help=True, help="Python environments for policies that the server's own does not suit.")
 _MORE = "More commands"
 app.command("serve")(serve_command)
@@ -124,7 +142,9 @@ def _list(listed: Sequence[Listed], name: str | None, *, as_json: bool) -> None:
     from vlagents_ray.cli.listing import installing
 
     if not (chosen := [one for one in listed if name in (None, one.name)]):
-        fail(f"{name!r} is not registered{did_you_mean(str(name), [one.name for one in listed])}", 2)
+        known = [one.name for one in listed]
+        cure = did_you_mean(str(name), known) or f"; there are {', '.join(known)}"
+        fail(f"{name!r} is not registered{cure}", 2)
     if as_json:
         print_json([asdict(one) for one in chosen])
         return

@@ -8,6 +8,9 @@ from __future__ import annotations
 import importlib.util
 import keyword
 import re
+import shlex
+import shutil
+import sys
 from importlib.resources import files
 from pathlib import Path
 from string import Template
@@ -27,8 +30,11 @@ def policy(name: Name) -> None:
     """Write NAME.py, test_NAME.py and NAME.yaml: a new policy, its test, and its deployment file."""
     with errors():
         _write(name, "policy")
-        out.print(f"vlagents-ray serve {name}.yaml                    serves it")
-        out.print(f"vlagents-ray eval tabletop --policy {name}.yaml   evaluates it")
+        command = as_typed("vlagents-ray")
+        _print_steps(
+            (f"{command} serve {name}.yaml", "serves it"),
+            (f"{command} eval tabletop --policy {name}.yaml --out runs/{name}", "evaluates it"),
+        )
 
 
 @new.command("env")
@@ -36,7 +42,7 @@ def environment(name: Name) -> None:
     """Write NAME.py, test_NAME.py and NAME.yaml: a new environment, its test, and a file of runs."""
     with errors():
         _write(name, "env")
-        out.print(f"vlagents-ray eval {name}.yaml   plays ten episodes in it")
+        _print_steps((f"{as_typed('vlagents-ray')} eval {name}.yaml", "runs ten episodes in it"))
 
 
 @new.command()
@@ -44,8 +50,13 @@ def dialect(name: Name) -> None:
     """Write NAME.py, test_NAME.py and NAME.yaml: a new protocol, its test, and a deployment file."""
     with errors():
         _write(name, "dialect")
-        out.print(f"vlagents-ray serve {name}.yaml   serves a policy that does nothing; then, in a second terminal:")
-        out.print(f'curl -d \'{{"q": [0, 0], "task": "lift the cup"}}\' http://localhost:8000/{name}')
+        _print_steps(
+            (f"{as_typed('vlagents-ray')} serve {name}.yaml", "serves a policy that does nothing"),
+            (
+                f'curl -d \'{{"q": [0, 0], "task": "lift the cup"}}\' http://localhost:8000/{name}',
+                "asks it, in a second terminal",
+            ),
+        )
 
 
 def _write(name: str, kind: Literal["policy", "env", "dialect"]) -> None:
@@ -67,4 +78,20 @@ def _write(name: str, kind: Literal["policy", "env", "dialect"]) -> None:
         with path.open("x") as file:
             file.write(text)
     out.print(f"wrote {', '.join(map(str, texts))}. Next, in this folder:")
-    out.print(f"pytest test_{name}.py   checks it")
+    _print_steps((f"{as_typed('python')} test_{name}.py", "checks it; so does pytest"))
+
+
+def as_typed(program: str) -> str:
+    """Return a program of this environment as a user types it: its name if the shell finds it, else its path."""
+    path = Path(sys.executable).with_name(program)
+    on_path = shutil.which(program)
+    if on_path is not None and Path(on_path).absolute() == path:
+        return program
+    return shlex.quote(str(path.relative_to(Path.cwd()) if path.is_relative_to(Path.cwd()) else path))
+
+
+def _print_steps(*steps: tuple[str, str]) -> None:
+    """Print commands to type next, each with its effect."""
+    width = max(len(command) for command, _ in steps)
+    for command, effect in steps:
+        out.print(f"{command:<{width}}   {effect}")

@@ -10,13 +10,14 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from vlagents_ray.bounds import MOST_EPISODES, MOST_ROWS
-from vlagents_ray.cli.console import errors, fresh, out, print_json, table
+from vlagents_ray.cli.console import errors, fresh, out, print_json, require_folder_of, table
 from vlagents_ray.cli.options import Address, AsJson, Live, LiveAt, finite, parse_list, parse_settings
 from vlagents_ray.errors import ConfigError
 
 if TYPE_CHECKING:
     from vlagents_ray.open_loop import ReplayPlan
 
+_TABLES = ("json", "csv", "parquet")  # formats of one file
 Folder = Annotated[Path, typer.Argument(metavar="FOLDER", help="Folder of results.")]
 
 
@@ -56,6 +57,7 @@ def report_command(
             print_json(summarize(results).to_json() | {"comparisons": [one.to_json() for one in found]})
             return
         path = path or (folders[0] / FILE if len(folders) == 1 else Path(FILE))
+        require_folder_of(path)
         out.print(f"report: {write_report(results, path, inline=inline)}")
 
 
@@ -102,6 +104,8 @@ def export_command(
         if settings and to != "hub":
             raise ConfigError(f"--hub-set: got --to {to}, want --to hub, whose scores they describe")
         chosen |= parse_settings(settings, "--hub-set")
+        if to in _TABLES:
+            require_folder_of(path)
         results = Results.load(folder).only(policy, env)
         with storing(path.parent):
             number = EXPORTS[to](results, path, **chosen)
@@ -136,6 +140,7 @@ def bundle_command(
 
     with errors():
         path = file or folder.absolute().with_name(f"{folder.absolute().name}.bundle.zip")
+        require_folder_of(path)
         digest = write_bundle(folder, path, videos=videos)
     out.print(f"bundle: {path}, {path.stat().st_size / 1e6:.1f} MB\nto cite: sha256:{digest}")
 

@@ -23,7 +23,7 @@ from pathlib import Path
 from typing import Any
 
 from vlagents_ray.errors import ConfigError, shown
-from vlagents_ray.naming import without_doubles
+from vlagents_ray.naming import did_you_mean, without_doubles
 from vlagents_ray.protocol.messages import RANKS, RankName
 
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,63}")
@@ -61,9 +61,11 @@ class Key:
             if value is not None and (isinstance(value, bool) or not isinstance(value, kinds) or not 0 < value < 1e12):
                 raise ConfigError(f"key {self.name!r}: {field}: got {value!r}, want a positive number")
         if self.rank is not None and self.rank not in RANKS:
-            raise ConfigError(f"key {self.name!r}: rank: got {self.rank!r}, want one of {list(RANKS)}")
+            meant = did_you_mean(str(self.rank), RANKS)
+            raise ConfigError(f"key {self.name!r}: rank: got {self.rank!r}, want one of {list(RANKS)}{meant}")
         if unknown := sorted(map(str, set(self.scopes) - set(SCOPES))):
-            raise ConfigError(f"key {self.name!r}: scopes: got {unknown}, want some of {list(SCOPES)}")
+            meant = "".join(did_you_mean(scope, SCOPES) for scope in unknown)
+            raise ConfigError(f"key {self.name!r}: scopes: got {unknown}, want some of {list(SCOPES)}{meant}")
         if not isinstance(self.revoked, bool):
             raise ConfigError(f"key {self.name!r}: revoked: got {self.revoked!r}, want true or false")
 
@@ -91,7 +93,8 @@ def _parse(entry: Any) -> Key:
         raise ConfigError(f"keys: got {shown(entry)}, want an object with 'name' and 'sha256' at least")
     known = {field.name for field in fields(Key)}
     if unknown := entry.keys() - known:
-        raise ConfigError(f"key {entry['name']!r}: unknown {sorted(unknown)}, want some of {sorted(known)}")
+        meant = "".join(did_you_mean(field, known) for field in unknown)
+        raise ConfigError(f"key {entry['name']!r}: unknown {sorted(unknown)}, want some of {sorted(known)}{meant}")
     lists = {field: entry.get(field) or [] for field in ("apps", "scopes")}
     for field, values in lists.items():
         if not isinstance(values, list) or not all(isinstance(value, str) for value in values):
@@ -153,7 +156,8 @@ def revoke(file: Path, name: str) -> None:
 
     def mark(keys: list[Key]) -> list[Key]:
         if all(key.name != name for key in keys):
-            raise ConfigError(f"no key {name!r} in {file}; there are {sorted(key.name for key in keys)}")
+            have = sorted(key.name for key in keys)
+            raise ConfigError(f"no key {name!r} in {file}; there are {have}{did_you_mean(name, have)}")
         return [replace(key, revoked=True) if key.name == name else key for key in keys]
 
     _change(file, mark)
