@@ -389,11 +389,20 @@ class KeyMapping:
         obs = Obs(cameras, gripper, state, info)
         if not cameras or not state:
             self._require_read(flat, obs)
-        text = None
-        if self.instruction is not None and (found := pick(flat, "", self.instruction, True, MissingState)):
-            needed = contract is not None and bool(contract.instruction)
-            text = read_text(self.instruction, found[0][2], self.instructions, limits, needed=needed)
-        return obs, text
+        return obs, self.read_instruction(flat, limits, contract)
+
+    def read_instruction(
+        self, flat: Mapping[str, Any], limits: Limits = DEFAULT_LIMITS, contract: Contract | None = None
+    ) -> str | None:
+        """Return the instruction of a client's observation, or None without one; raises `InvalidObservation`."""
+        if self.instruction is None:
+            return None
+        picked = pick(flat, "", self.instruction, True, MissingState)
+        if not picked:
+            return None
+        _, _, value = picked[0]
+        is_needed = contract is not None and bool(contract.instruction)
+        return read_text(self.instruction, value, self.instructions, limits, needed=is_needed)
 
     def rows(self, action: np.ndarray, spec: ActionSpec | None = None) -> np.ndarray:
         """Return our action, (D,) or (H, D), as (H, D) float32 with the gripper's commands in the client's convention.

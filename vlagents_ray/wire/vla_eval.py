@@ -115,10 +115,10 @@ def _node(value: Any) -> Any:
 
 PRESETS: dict[str, dict[str, Any]] = {
     # The benchmark chooses the names of cameras. Most benchmarks call the state `states`, some `state`, as recommended
-    # in vla-eval's types.py; its own servers prefer the former.
+    # in vla-eval's types.py; its own servers prefer the former. RoboTwin's is `joint_state`.
     "vla-eval": {
         "cameras": {"*": "images/*"},
-        "state": {"state": {"key": "states|state", "optional": True}},
+        "state": {"state": {"key": "states|state|joint_state", "optional": True}},
         "instruction": "task_description",
     }
 }

@@ -297,6 +297,25 @@ def test_of_observations_that_nobody_waits_for_the_newest_is_acted_on() -> None:
         assert [receive(socket).seq for _ in range(3)] == [1, 49, 50]
 
 
+def test_observations_between_two_chunks_need_no_images() -> None:
+    """A benchmark that renders every third observation, as the chunk's other rows are executed in the open."""
+    rendered = {name: value for name, value in seen(3).items() if name != "state"} | {"joint_state": np.ones(3)}
+    bare = {"task_description": "task 1"}
+    with serving(Mirror(chunk=3), {"vla_eval": {}}) as (client, _), client.websocket_connect("/vla-eval") as socket:
+
+        def answer(payload: dict[str, Any], seq: int) -> Any:
+            send(socket, "observation", payload, seq)
+            return receive(socket)
+
+        rows = [answer(rendered if seq % 3 == 0 else bare, seq) for seq in range(6)]
+        assert [message.kind for message in rows] == ["action"] * 6
+        assert [float(message.payload["actions"][4]) for message in rows] == [0, 1, 2, 0, 1, 2]
+        # Where a chunk ends or another task begins, an observation without images is an error again.
+        assert answer(bare, 6).kind == "error"
+        assert answer(rendered, 7).kind == "action"
+        assert answer({"task_description": "task 2"}, 8).kind == "error"
+
+
 def test_a_client_that_sends_far_more_than_it_waits_for_is_cut_off() -> None:
     with serving(Mirror(slow_s=0.1), {"vla_eval": {}}) as (client, _), client.websocket_connect("/") as socket:
         for seq in range(100):

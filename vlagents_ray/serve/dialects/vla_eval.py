@@ -131,11 +131,13 @@ class VlaEvalDialect(base.RouteDialect):
         incoming = self.arrived()
         request_id = uuid.uuid4().hex
         try:
-            payload = await admission.decoded(partial(vla_eval.decode_images, message.payload))
-            obs, instruction = self.read(payload)
-            if not session.episode.begun:
-                self.mapping.warn_of_unread_cameras(payload, self.name)
-            if chunk.next is None or session.episode.begins(instruction):
+            # Some benchmarks render only the observations that begin a chunk: those of its other rows are not read.
+            text = self.mapping.read_instruction(message.payload, self.context.limits, self.context.contract)
+            if chunk.next is None or session.episode.begins(text):
+                payload = await admission.decoded(partial(vla_eval.decode_images, message.payload))
+                obs, instruction = self.read(payload)
+                if not session.episode.begun:
+                    self.mapping.warn_of_unread_cameras(payload, self.name)
                 incoming.decoded_alike()
                 reply = await session.act(incoming, obs, instruction, request_id)
                 rows = incoming.written(lambda: self.rows(reply))
