@@ -32,7 +32,7 @@ from vlagents_ray.interface import Act, Agent, Obs
 from vlagents_ray.policies.loading import report_device, report_progress, report_uncompiled
 from vlagents_ray.policies.wrapper import build_agent
 from vlagents_ray.protocol.frames import read_error
-from vlagents_ray.protocol.messages import Reply, Request
+from vlagents_ray.protocol.messages import LocalAddress, Reply, Request
 from vlagents_ray.serve.config.deployment import ServerArgs
 from vlagents_ray.serve.python_env import child_main
 from vlagents_ray.serve.python_env.child_main import Settings
@@ -89,7 +89,7 @@ class Child:
         self._process = spawned
         try:
             self.loaded = self._introduced(spawned, keeper)
-            self._transport = ShmTransport(self.loaded["local"])
+            self._transport = ShmTransport(LocalAddress(**self.loaded["local"]))
             self._transport.connect(_CONNECT_S)
         except BaseException:
             self.close()
