@@ -321,7 +321,27 @@ def moved(poses: Tensor, actions: Tensor) -> Tensor:
 
 CAMERA = "front"  # the model has one unnamed camera
 _STATE = ["xyzrpy"]
-_GOAL, _GOAL_FEATURES = "goal", "goal_features"  # keys in a session's memory: pixels, and their features
+_GOAL = "goal"  # key in a session's memory
+
+
+class Goal:
+    """A goal image, and its features once they are computed; a copy or a pickle needs no device."""
+
+    def __init__(self, pixels: np.ndarray, features: Any = None) -> None:
+        self.pixels = pixels  # (3, side, side) float32
+        self.features = (
+            features  # (N, F) float32, a tensor on the model's device, or an array of a pickle; None: not yet
+        )
+
+    def __deepcopy__(self, memo: object) -> Goal:
+        return self  # of samples, which share the features
+
+    def __reduce__(self) -> tuple[type[Goal], tuple[np.ndarray, np.ndarray | None]]:
+        features = self.features
+        return Goal, (
+            self.pixels,
+            features if features is None or isinstance(features, np.ndarray) else fetch(features),
+        )
 
 
 @dataclass(frozen=True, slots=True)
@@ -420,10 +440,9 @@ class VJepa2Ac(ModelPolicy):
         if not isinstance(image, np.ndarray) or image.ndim != 3 or image.shape[2] != 3 or image.dtype != np.uint8:
             got = f"{image.shape} {image.dtype}" if isinstance(image, np.ndarray) else type(image).__name__
             raise InvalidObservation(f"info[{GOAL_IMAGE!r}]: got {got}, want (H, W, 3) uint8 RGB")
-        goal, memory = to_pixels(image, self.config.image_size), self._begun().memory
-        if _GOAL not in memory or not np.array_equal(goal, memory[_GOAL]):
-            memory[_GOAL] = goal
-            memory.pop(_GOAL_FEATURES, None)
+        pixels, memory = to_pixels(image, self.config.image_size), self._begun().memory
+        if _GOAL not in memory or not np.array_equal(pixels, memory[_GOAL].pixels):
+            memory[_GOAL] = Goal(pixels)
 
     def perceive(self, obs: Obs) -> Frame:
         pose = state_vector(obs, [*self._state, GRIPPER], 7)
@@ -440,19 +459,22 @@ class VJepa2Ac(ModelPolicy):
     def _plans(self, rows: Sequence[Row]) -> list[Prediction]:
         torch = require("torch")
         config, world = self.config, self.model
-        new = [row for row in rows if _GOAL_FEATURES not in row.memory]
+        goals = [row.memory[_GOAL] for row in rows]
+        new_goals = [goal for goal in dict.fromkeys(goals) if goal.features is None]  # each once, for all its samples
         shape = (config.iterations, config.rollout, config.samples, DRAWN)
         with torch.inference_mode(), world.autocast(), usual_attention():
             features = world.encode([row.frames[-1].pixels for row in rows])
-            goals_of_new = world.encode([row.memory[_GOAL] for row in new]) if new else []
-            for row, goal in zip(new, goals_of_new, strict=True):
-                row.memory[_GOAL_FEATURES] = goal.clone()
+            features_of_new = world.encode([goal.pixels for goal in new_goals]) if new_goals else []
+            for goal, goal_features in zip(new_goals, features_of_new, strict=True):
+                goal.features = goal_features.clone()
+            for goal in goals:
+                goal.features = torch.as_tensor(goal.features).to(features.device, non_blocking=True)
             poses, noise = (
                 torch.as_tensor(np.stack(parts)).to(features.device, non_blocking=True)
                 for parts in ([row.frames[-1].pose for row in rows], [row.noise(*shape) for row in rows])
             )
-            goals = torch.stack([row.memory[_GOAL_FEATURES] for row in rows])
-            plans = plan(world, features, poses, goals, noise, config)
+            goal_features = torch.stack([goal.features for goal in goals])
+            plans = plan(world, features, poses, goal_features, noise, config)
         actions, std, energy = (fetch(part) for part in (plans.actions, plans.std, plans.energy))
         predictions = []
         for i, row in enumerate(rows):
@@ -462,7 +484,7 @@ class VJepa2Ac(ModelPolicy):
 
     def _example(self, seed: int, instruction: str = "warm up") -> Row:
         example = super()._example(seed, instruction)
-        return replace(example, memory={_GOAL: example.frames[-1].pixels})
+        return replace(example, memory={_GOAL: Goal(example.frames[-1].pixels)})
 
 
 def _openings(actions: np.ndarray, closedness: float) -> np.ndarray:

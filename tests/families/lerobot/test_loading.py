@@ -7,17 +7,20 @@ import shutil
 import sys
 from collections.abc import Callable
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
+import torch
 from safetensors.torch import load_file, save_file
 
 from tests.families.lerobot import tiny
 from tests.families.lerobot.conftest import FILTERS, PATCHED, Load, Made, begun, view
 from vlagents_ray.contract import CameraSpec
 from vlagents_ray.errors import ConfigError
-from vlagents_ray.policies.lerobot import LeRobot
+from vlagents_ray.policies.lerobot import LeRobot, checkpoint
+from vlagents_ray.policies.lerobot.config import LeRobotConfig
 
 pytestmark = FILTERS
 
@@ -172,6 +175,27 @@ def test_a_step_that_takes_code_from_the_hub_by_itself_is_refused(
 def test_a_wrong_setting_is_refused(config: dict[str, Any], text: str, made: Made) -> None:
     with pytest.raises(ConfigError, match=text):
         opened(made("act"), **config)
+
+
+@pytest.mark.parametrize(
+    ("saved", "dtype", "device", "warned"),
+    [
+        ("float32", "auto", "cuda", True),
+        ("float32", "auto", "cuda:1", True),
+        ("bfloat16", "auto", "cuda", False),
+        ("float32", "float32", "cuda", False),
+        ("bfloat16", "bfloat16", "cuda", False),
+        ("float32", "auto", "cpu", False),
+        (None, "auto", "cuda", False),  # a type without the setting, such as ACT
+    ],
+)
+def test_float32_that_nobody_chose_is_warned_of_on_a_gpu(
+    saved: str | None, dtype: str, device: str, warned: bool, caplog: pytest.LogCaptureFixture
+) -> None:
+    config = LeRobotConfig(checkpoint="none", dtype=dtype)
+    settings = SimpleNamespace() if saved is None else SimpleNamespace(dtype=saved)
+    checkpoint._warn_of_float32(settings, config, torch.device(device))
+    assert ("set the policy's dtype: bfloat16" in caplog.text) == warned
 
 
 @pytest.mark.verifies("loading")

@@ -177,13 +177,14 @@ def test_the_goal_may_come_later_and_change(policy: VJepa2Ac) -> None:
     with pytest.raises(InvalidObservation, match=r"goal_image.*got none since the reset"):
         session.act(obs(1))
     session.act(obs(1, goal=5))
-    features = session.episode.memory["goal_features"]
+    goal = session.episode.memory["goal"]
+    features = goal.features
     session.act(obs(2, goal=5))
-    assert session.episode.memory["goal_features"] is features  # the same image is not encoded again
     session.act(obs(2))
-    assert session.episode.memory["goal_features"] is features
+    assert session.episode.memory["goal"] is goal  # the same image is not encoded again
+    assert goal.features is features
     session.act(obs(2, goal=6))
-    assert session.episode.memory["goal_features"] is not features
+    assert session.episode.memory["goal"] is not goal
 
 
 @pytest.mark.verifies("isolation")

@@ -2,13 +2,18 @@
 
 from __future__ import annotations
 
+import copy
+import pickle
+from collections.abc import Sequence
+from contextlib import nullcontext
 from typing import Any
 
 import numpy as np
 import pytest
 
 from vlagents_ray.errors import ConfigError
-from vlagents_ray.policies.vjepa2_ac import DRAWN, VJepa2Ac, VJepa2AcConfig, moved, plan
+from vlagents_ray.policies.base import Row
+from vlagents_ray.policies.vjepa2_ac import DRAWN, Frame, Goal, VJepa2Ac, VJepa2AcConfig, moved, plan
 
 torch = pytest.importorskip("torch")
 pytestmark = pytest.mark.torch
@@ -98,3 +103,43 @@ def test_a_plan_closes_from_the_step_that_the_config_says() -> None:
 def test_settings_that_cannot_work_are_refused(settings: dict[str, Any], says: str) -> None:
     with pytest.raises(ConfigError, match=f"(?s){says}"):
         VJepa2Ac.from_config({"checkpoint": "none", **settings})
+
+
+class PoseWorld:
+    """A world model whose images are poses."""
+
+    def __init__(self) -> None:
+        self.encoded = 0  # images
+
+    def autocast(self) -> Any:
+        return nullcontext()
+
+    def encode(self, pixels: Sequence[np.ndarray]) -> torch.Tensor:
+        self.encoded += len(pixels)
+        return seen(torch.from_numpy(np.stack(pixels)))
+
+    def __call__(self, *inputs: torch.Tensor) -> torch.Tensor:
+        return world(*inputs)
+
+
+def test_the_features_of_a_goal_move_without_its_device_and_are_not_computed_again() -> None:
+    policy = VJepa2Ac(config(samples=20, iterations=2))
+    policy.model = network = PoseWorld()
+    start = np.array([0.3, 0.0, 0.4, 3.1, 0.0, 0.0, 0.5], np.float32)
+    row = Row((Frame(start, start),), "", np.random.default_rng(0), memory={"goal": Goal(start + np.float32(0.04))})
+    samples = [Row(row.frames, "", np.random.default_rng(i), memory=copy.deepcopy(row.memory)) for i in (1, 2)]
+    policy._plans([row, *samples])
+    assert network.encoded == 3 + 1  # the images of three rows, and one goal
+    pickled = pickle.dumps(row.memory)
+    assert b"torch" not in pickled, "a tensor of a GPU can only be unpickled where the same GPU is"
+    there = pickle.loads(pickled)  # noqa: S301 - the test wrote it
+    np.testing.assert_array_equal(there["goal"].features, row.memory["goal"].features)
+
+    def planned(memory: dict[str, Any]) -> np.ndarray:
+        [prediction] = policy._plans([Row(row.frames, "", np.random.default_rng(5), memory=memory)])
+        return prediction.actions
+
+    np.testing.assert_array_equal(planned(there), planned(row.memory))
+    assert network.encoded == 4 + 2
+    assert isinstance(there["goal"].features, torch.Tensor), "once it is on the device, it stays there"
+    assert b"torch" not in pickle.dumps(there)

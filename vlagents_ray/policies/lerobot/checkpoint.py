@@ -7,6 +7,7 @@ import dataclasses
 import functools
 import importlib.util
 import json
+import logging
 import sys
 from collections.abc import Mapping
 from pathlib import Path
@@ -19,6 +20,8 @@ from vlagents_ray.policies.lerobot.config import LeRobotConfig, is_new, other_ve
 from vlagents_ray.policies.lerobot.kinds import KINDS, LONGEST_PREFIX, Diffusion, Flow
 from vlagents_ray.policies.lerobot.processors import PIPELINES, require_known_steps
 from vlagents_ray.registry import require
+
+logger = logging.getLogger(__name__)
 
 WEIGHTS = "model.safetensors"
 TRAINED = "pretrained_model"  # LeRobot's checkpoint folder within the folder of a training step
@@ -65,6 +68,7 @@ def load(folder: Path, config: LeRobotConfig, device: Any) -> Any:
             f"or to be replaced by `overrides`"
         ) from error
     require_loaded(policy, _as_loaded(policy, saved))
+    _warn_of_float32(settings, config, device)
     if config.dtype == "float32":
         policy.float()
     elif as_saved:
@@ -141,6 +145,15 @@ def _prepare(settings: Any, config: LeRobotConfig, device: Any) -> bool:
     if as_saved:
         settings.load_vlm_weights = False  # would be downloaded in bfloat16, only to be replaced
     return as_saved
+
+
+def _warn_of_float32(settings: Any, config: LeRobotConfig, device: Any) -> None:
+    """Warn if `auto` is float32 on a GPU, which is the default of LeRobot's configs, not of its published models."""
+    if device.type != "cpu" and config.dtype == "auto" and getattr(settings, "dtype", None) == "float32":
+        logger.warning(
+            "dtype: auto is float32 here, as in the checkpoint's config.json: weights take twice the memory of "
+            "bfloat16, and acts at least twice the time; set the policy's dtype: bfloat16, or dtype: float32 to keep it"
+        )
 
 
 def _said(error: BaseException | None) -> str:
