@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import functools
+import importlib
+import re
 import sys
 from collections.abc import Callable, Iterator
 from dataclasses import replace
@@ -12,12 +15,14 @@ import pytest
 from in_process_evaluation import flat_config
 
 from vlagents_ray.errors import ConfigError
-from vlagents_ray.evaluate import EvalConfig, Results, compare
+from vlagents_ray.evaluate import EvalConfig, Results, compare, evaluate
 from vlagents_ray.evaluate.episode.records import EnvInfo, EpisodeResult
 from vlagents_ray.evaluate.exports.tables import rows
-from vlagents_ray.evaluate.merge import merge
+from vlagents_ray.evaluate.merge import combined, merge
 from vlagents_ray.evaluate.plan.cases import cells
 from vlagents_ray.evaluate.plan.jobs import plan
+from vlagents_ray.evaluate.report.page import write_report
+from vlagents_ray.evaluate.report.success import compare_all, families_json
 from vlagents_ray.evaluate.results.store import Store
 from vlagents_ray.evaluate.results.summary import summarize
 from vlagents_ray.policies.base.program import code_of_class, digest_of, files_named
@@ -65,7 +70,15 @@ def served(own_weights: str | None) -> dict[str, Any]:
     return {"policy": "prog_pilot:Pilot", "checkpoint": "w.npz", "weights": weights, "program": program}
 
 
-def played(out: Path, *, episodes: int = 2, own_weights: str | None = None, **changes: Any) -> EvalConfig:
+def played(
+    out: Path,
+    *,
+    episodes: int = 2,
+    own_weights: str | None = None,
+    description: dict[str, Any] | None = None,
+    contract: dict[str, Any] | None = None,
+    **changes: Any,
+) -> EvalConfig:
     """Play the episodes of a plan that have no result, without a simulator."""
     settings = {"envs": ["prog_env:Sea"], "episodes": episodes, "env_options": {"folder": "chart.txt"}, "policy": "own"}
     config = flat_config(**{**settings, "out": out, **changes})
@@ -76,7 +89,8 @@ def played(out: Path, *, episodes: int = 2, own_weights: str | None = None, **ch
             if str(job.key) in store.finished():
                 continue
             store.note_policy(job.cell.policy.name, said)
-            store.note_env(job.cell.place, EnvInfo({}, {}, program=dict(job.cell.program), host="here"))
+            made = EnvInfo(description or {}, contract or {}, program=dict(job.cell.program), host="here")
+            store.note_env(job.cell.place, made)
             result = EpisodeResult(job.key, "done", True, True, steps=4, ending="truncated", checkpoint="w.npz")
             store.record(replace(result, weights=said["weights"]["digest"]), attempts=1)
         store.end_run("complete")
@@ -166,6 +180,130 @@ def test_two_policies_are_not_compared_in_different_environments(work: Path, tmp
     played(out, policy="b", resume=True, accept_changes=True)
     with pytest.raises(ConfigError, match=r"(?s)not played in the same environment.*prog_parts/sea.py was"):
         compare(Results.load(out), "a", "b")
+
+
+def compared(tmp_path: Path, change: Callable[[], Any], **options: Any) -> Results:
+    """Two policies in two folders, between which something changed."""
+    played(tmp_path / "a", **STATED)
+    again: dict[str, Any] = change() or {}
+    played(tmp_path / "b", **{**STATED, **again, "policy": "another"})
+    results = combined([Results.load(tmp_path / name) for name in ("a", "b")])
+    found = compare(results, "own", "another", **options)
+    return replace(results, runs=(replace(results.runs[0], changes=found.changes),))
+
+
+def reported(tmp_path: Path, change: Callable[[], Any], **options: Any) -> Results:
+    """As `compared`, by the page and the JSON of `report`, which name the pairs that they do not compare."""
+    played(tmp_path / "a", **STATED)
+    again: dict[str, Any] = change() or {}
+    played(tmp_path / "b", **{**STATED, **again, "policy": "another"})
+    results = combined([Results.load(tmp_path / name) for name in ("a", "b")])
+    view = compare_all(summarize(results), **options)
+    assert view is not None
+    of_json = families_json(summarize(results), **options)
+    assert len(of_json) == sum(len(part.shown) for part in view.parts)
+    if view.reasons:
+        assert not of_json
+        raise ConfigError("\n".join(view.reasons))
+    assert ("allowed" in write_report(results, tmp_path / "page.html", **options).read_text()) == bool(view.changes)
+    return replace(results, runs=(replace(results.runs[0], changes=tuple(view.changes)),))
+
+
+def resumed_as_stated(tmp_path: Path, change: Callable[[], Any], **options: Any) -> Results:
+    played(tmp_path / "out", **STATED)
+    again: dict[str, Any] = change() or {}
+    return Results.load(played(tmp_path / "out", resume=True, **{**STATED, "episodes": 4, **again, **options}).out)
+
+
+def merged_as_stated(tmp_path: Path, change: Callable[[], Any], **options: Any) -> Results:
+    played(tmp_path / "a", **STATED)
+    again: dict[str, Any] = change() or {}
+    played(tmp_path / "b", **{**STATED, "seed": 100, **again})
+    return merge(tmp_path / "c", [tmp_path / "a", tmp_path / "b"], **options).results
+
+
+STATED: dict[str, Any] = {"description": {"mujoco": "3.3.0", "assets": "a1"}, "contract": {"control_hz": 20}}
+COMMANDS = [resumed_as_stated, merged_as_stated, compared, reported]
+# What `--resume` refuses about an environment: the change, and the name that a message has for it.
+OF_THE_ENV: dict[str, tuple[Callable[[], Any], str]] = {
+    "its code": (lambda: edit("prog_parts/sea.py"), "prog_parts/sea.py was"),
+    "a file of its settings": (lambda: edit("chart.txt"), "chart.txt was"),
+    "its simulator's version": (
+        lambda: {"description": {"mujoco": "2.3.7", "assets": "a1"}},
+        "its description 'mujoco' was '3.3.0', is '2.3.7'",
+    ),
+    "a part of its description that is gone": (
+        lambda: {"description": {"mujoco": "3.3.0"}},
+        "its description 'assets' was 'a1', is None",
+    ),
+    "its contract": (lambda: {"contract": {"control_hz": 10}}, "its contract 'control_hz' was 20, is 10"),
+}
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+@pytest.mark.parametrize("identity", OF_THE_ENV)
+def test_every_command_refuses_another_environment_unless_the_change_is_accepted(
+    work: Path, tmp_path: Path, command: Callable[..., Results], identity: str
+) -> None:
+    change, told = OF_THE_ENV[identity]
+    with pytest.raises(ConfigError, match=rf"(?s){re.escape(told)}.*--accept-changes"):
+        command(tmp_path / "refused", change)
+    found = command(tmp_path / "accepted", change, accept_changes=True)
+    assert any(told.partition(" was")[0] in str(one) for one in found.accepted_changes)
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_no_command_refuses_the_same_environment(work: Path, tmp_path: Path, command: Callable[..., Results]) -> None:
+    assert command(tmp_path, lambda: None).accepted_changes == []
+
+
+@pytest.mark.parametrize("identity", ["its simulator's version", "its contract", "its policy's code", "its weights"])
+def test_a_cell_in_which_a_change_was_accepted_is_not_compared_unless_that_is_accepted_again(
+    work: Path, tmp_path: Path, identity: str
+) -> None:
+    of_the_policy = {"its policy's code": lambda: edit("prog_helm.py"), "its weights": lambda: {"own_weights": "x"}}
+    change = of_the_policy[identity] if identity in of_the_policy else OF_THE_ENV[identity][0]
+    resumed_as_stated(tmp_path, change, accept_changes=True)
+    changed_again: dict[str, Any] = {} if identity in of_the_policy else change()
+    played(tmp_path / "other", **{**STATED, **changed_again, "policy": "another"})
+    both = combined([Results.load(tmp_path / name) for name in ("out", "other")])
+    with pytest.raises(ConfigError, match=r"(?s)were played with .*as --accept-changes allowed"):
+        compare(both, "own", "another")
+    assert compare(both, "own", "another", accept_changes=True).total.pairs.total == 2
+
+
+@pytest.mark.parametrize("change", [lambda: edit("prog_helm.py"), lambda: {"own_weights": "mine"}])
+def test_a_report_of_two_folders_keeps_a_policy_apart_that_is_not_the_same_in_both(
+    work: Path, tmp_path: Path, change: Callable[[], Any]
+) -> None:
+    played(tmp_path / "a")
+    again: dict[str, Any] = change() or {}
+    played(tmp_path / "b", envs=["eval_fakes:Line"], env_options={}, **again)
+    results = combined([Results.load(tmp_path / name) for name in ("a", "b")])
+    assert results.contenders == ["own (a)", "own (b)"]
+
+
+@pytest.mark.parametrize("way", ["a class", "a partial", "a mapping", "a mapping of partials"])
+def test_the_code_of_an_own_policy_is_part_of_the_program_however_it_is_given(
+    work: Path, tmp_path: Path, way: str
+) -> None:
+    Path("prog_own.py").write_text("from eval_fakes import ToZero\nclass Own(ToZero):\n    pass\n")
+
+    def run(episodes: int, **options: Any) -> None:
+        make: Any = importlib.import_module("prog_own").Own
+        if "partial" in way:
+            make = functools.partial(make, chunk=1)
+        config = flat_config(
+            envs=["eval_fakes:Line"], policy="own", episodes=episodes, out=tmp_path / "out", workers=0, video="none",
+            **options,
+        )  # fmt: skip
+        evaluate(config, agent_factory={"own": make} if "mapping" in way else make)
+
+    run(1)
+    run(2, resume=True)
+    edit("prog_own.py")
+    with pytest.raises(ConfigError, match=r"policy own: .*prog_own.py was sha256"):
+        run(3, resume=True)
 
 
 def test_a_cell_of_two_programs_is_not_compared(work: Path, tmp_path: Path) -> None:

@@ -27,6 +27,10 @@ def report_command(
         Path | None, typer.Option("--out", help="Default: report.html in FOLDER; of several, here.")
     ] = None,
     inline: Annotated[bool, typer.Option("--inline", help="With videos in the page, as far as they fit.")] = False,
+    accept_changes: Annotated[
+        bool,
+        typer.Option("--accept-changes", help="Compare although files, weights or envs differ; the report says so."),
+    ] = False,
     as_json: AsJson = False,
     live: Live = False,
     live_at: LiveAt = None,
@@ -38,7 +42,7 @@ def report_command(
     from vlagents_ray.evaluate import Results
     from vlagents_ray.evaluate.merge import combined
     from vlagents_ray.evaluate.report.page import FILE, write_report
-    from vlagents_ray.evaluate.results.comparison import comparable, comparisons
+    from vlagents_ray.evaluate.report.success import families_json
     from vlagents_ray.evaluate.results.summary import summarize
 
     with errors():
@@ -53,12 +57,14 @@ def report_command(
             return
         results = combined([Results.load(folder) for folder in folders])
         if as_json:
-            found = comparisons(results, comparable(results)[0])
-            print_json(summarize(results).to_json() | {"comparisons": [one.to_json() for one in found]})
+            summary = summarize(results)
+            compared = families_json(summary, accept_changes=accept_changes)
+            print_json(summary.to_json() | {"comparisons": compared})
             return
         path = path or (folders[0] / FILE if len(folders) == 1 else Path(FILE))
         require_folder_of(path)
-        out.print(f"report: {write_report(results, path, inline=inline)}")
+        written = write_report(results, path, inline=inline, accept_changes=accept_changes)
+        out.print(f"report: {written}")
 
 
 def export_command(

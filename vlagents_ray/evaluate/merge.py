@@ -18,7 +18,15 @@ from vlagents_ray.evaluate.artifacts import storage
 from vlagents_ray.evaluate.plan.config import canonical
 from vlagents_ray.evaluate.report.page import FILE as REPORT
 from vlagents_ray.evaluate.report.page import write_report
-from vlagents_ray.evaluate.results.changes import Change, changed, listed, policy_changes, program_changes
+from vlagents_ray.evaluate.results.changes import (
+    Change,
+    EnvStatement,
+    changed,
+    env_changes,
+    listed,
+    policy_changes,
+    program_changes,
+)
 from vlagents_ray.evaluate.results.database import FILE, create, insert
 from vlagents_ray.evaluate.results.reader import CellResults, Results, Run, Worker, episode_of, reading, table
 from vlagents_ray.evaluate.results.summary import Summary, stated, summarize, write_summary
@@ -50,7 +58,8 @@ def merge(out: Path, folders: Sequence[Path], *, keep_first: bool = False, accep
         out: A folder without results; it is made if it is missing.
         folders: Folders of results.
         keep_first: Whether the first folder wins for an episode with different outcomes.
-        accept_changes: Merge although files of a policy or an env, or weights, differ; the report shows it.
+        accept_changes: Merge although files of a policy or an env, weights, or the description or the contract of an
+            env differ; the report shows it.
 
     Returns:
         The summary of the merged results.
@@ -70,7 +79,7 @@ def merge(out: Path, folders: Sequence[Path], *, keep_first: bool = False, accep
             found = _add_policies(merged, folder, db) + _add_cells(merged, folder, db)
             if found and not accept_changes:
                 raise ConfigError(
-                    f"{folder} was not played with the program of the folders before it:\n{listed(found)}\n"
+                    f"{folder} was not played with the same program as the folders before it:\n{listed(found)}\n"
                     f"merge them apart, or mix them and have the report say so (--accept-changes)"
                 )
             conflicts += _add_episodes(merged, folder, db)
@@ -139,6 +148,11 @@ def _add_cells(merged: _Merged, folder: Path, db: sqlite3.Connection) -> list[Ch
             raise ConfigError(f"{folder}: {where} stops early by {row['stop']}, that before it by {known['stop']}")
         programs = [None if one["program"] is None else json.loads(one["program"]) for one in (known, row)]
         changes |= dict.fromkeys(program_changes(f"env {row['env']}", *programs))
+        statements = [
+            EnvStatement(json.loads(one["described"] or "{}"), json.loads(one["contract"] or "{}"))
+            for one in (known, row)
+        ]
+        changes |= dict.fromkeys(env_changes(row["env"], *statements))
         for name in ("described", "contract", "code", "program"):
             known[name] = known[name] or row[name]
         _extend(known, row, folder)
@@ -226,8 +240,8 @@ def _link_files(merged: _Merged, out: Path, folders: Sequence[Path]) -> None:
 def combined(folders: Sequence[Results]) -> Results:
     """Combine the results of several folders.
 
-    If two folders have a policy in the same env, or with other weights under the same checkpoint's name, the folder's
-    name is appended: "pi0 (second)".
+    If two folders have a policy in the same env, or with other files, or with other weights under the same checkpoint's
+    name, the folder's name is appended: "pi0 (second)".
 
     Raises:
         ConfigError: There is no folder, or two of them are parts of one evaluation, which are merged, not compared.
@@ -253,6 +267,12 @@ def combined(folders: Sequence[Results]) -> Results:
         weights, checkpoint = stated(cell, "weights"), stated(cell, "checkpoint")
         if weights is not None and known.setdefault((cell.contender, checkpoint), weights) != weights:
             clashing.add(cell.policy)
+    swept = {cell.policy for cell in every if cell.step is not None}
+    metadata: dict[str, dict[str, Any]] = {}  # of the first folder with the policy
+    for each in folders:
+        for name, of_server in each.policies.items():
+            if changed(metadata.setdefault(name, of_server), of_server, swept=name in swept) is not None:
+                clashing.add(name)
     homes = [each.out.resolve() for each in folders]
     base = Path(os.path.commonpath(homes))
     cells: list[CellResults] = []

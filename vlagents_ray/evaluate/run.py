@@ -7,9 +7,8 @@ import logging
 import threading
 import time
 from collections import Counter
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
-from typing import Any
 
 from vlagents_ray.errors import ConfigError, StorageFailed, VLAgentsError, from_code
 from vlagents_ray.evaluate.artifacts.recorder import Artifacts, save
@@ -27,7 +26,8 @@ from vlagents_ray.evaluate.results.summary import Summary, summarize, write_summ
 from vlagents_ray.evaluate.trackers import TrackerFeed
 from vlagents_ray.evaluate.workers.base import SIGNAL_S, FailedAttempts, Workers, chosen_workers, dispatch
 from vlagents_ray.evaluate.workers.in_process import workers_class
-from vlagents_ray.evaluate.workers.rollout import AgentFactory, OwnAgents, Report, agents, factory_program
+from vlagents_ray.evaluate.workers.rollout import AgentFactory, OwnAgents, Report, agents, factory_programs
+from vlagents_ray.policies.base.program import Program
 from vlagents_ray.ray_tools.signals import stop_signals
 
 log = logging.getLogger(__name__)
@@ -105,7 +105,7 @@ def evaluate(
             save_diffs(config.out, driver_code().values())
         try:
             with tracking:
-                local = {"program": factory_program(agent_factory)} if callable(agent_factory) else {}
+                local = factory_programs(config, agent_factory)
                 run = _Run(config, store, progress or Progress(), tracking, only, end_at, local)
                 state, summary = run.play(factory)
         except BaseException:
@@ -151,7 +151,7 @@ class _Run:
     tracking: TrackerFeed
     only: tuple[int, int] | None
     end_at: float | None
-    local_program: dict[str, Any]
+    local_programs: Mapping[str, Program]  # of own agents, by policy
 
     def __post_init__(self) -> None:
         config, store = self.config, self.store
@@ -221,7 +221,9 @@ class _Run:
 
     def _handle(self, job: Job, report: Report) -> None:
         if report.policy is not None:
-            self.store.note_policy(job.cell.policy.name, self.local_program | report.policy)
+            name = job.cell.policy.name
+            local = {"program": self.local_programs[name]} if name in self.local_programs else {}
+            self.store.note_policy(name, local | report.policy)
             save_diffs(self.config.out, [policy_code(report.policy)])
         if report.env is not None:
             self.store.note_env(job.cell.place, report.env)

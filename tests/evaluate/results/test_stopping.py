@@ -10,7 +10,7 @@ import pytest
 from eval_fakes import LINE, OTHER_LINE, ToZero
 from pydantic import ValidationError
 
-from vlagents_ray.errors import InvalidInput
+from vlagents_ray.errors import ConfigError, InvalidInput
 from vlagents_ray.evaluate import EvalConfig, Results, evaluate
 from vlagents_ray.evaluate.episode.records import EpisodeResult
 from vlagents_ray.evaluate.plan.config import StopConfig
@@ -159,7 +159,9 @@ def test_what_a_stopped_cell_says_holds_and_resuming_plays_nothing(config: Confi
     evaluate(config(episodes=40, stop=STOP, workers=0, resume=True), agent_factory=ToZero)
     [again] = Results.load(settings.out).cells
     assert again.episodes == cell.episodes
-    whole = evaluate(config(episodes=40, workers=0, resume=True), agent_factory=ToZero)
+    with pytest.raises(ConfigError, match=r"plan: .*early stopping was"):
+        evaluate(config(episodes=40, workers=0, resume=True), agent_factory=ToZero)
+    whole = evaluate(config(episodes=40, workers=0, resume=True, accept_changes=True), agent_factory=ToZero)
     assert whole.total.episodes == 40
     assert whole.total.success_once.error_rate is None
 

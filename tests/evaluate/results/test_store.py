@@ -117,6 +117,37 @@ def test_results_of_other_settings_are_not_resumed(config: Config, change: dict[
 
 
 @pytest.mark.parametrize(
+    ("changes", "told"),
+    [
+        ({"episodes": 4}, "episodes was 6, is 4"),
+        ({"seeds": [0]}, r"seeds was \[0, 100\], is \[0\]"),
+        ({"envs": [LINE]}, "OtherLine was in it"),
+        ({"stop": {"target": 0.5}}, "early stopping was None, is .*target"),
+    ],
+)
+def test_a_plan_that_becomes_smaller_or_may_stop_early_is_a_change(
+    config: Config, changes: dict[str, object], told: str
+) -> None:
+    planned_first = {"envs": [LINE, OTHER_LINE], "seeds": [0, 100]}
+    with Store(config(**planned_first)) as store:
+        store.begin_run(config(**planned_first), {})
+        for job in plan(store.cells):
+            store.record(done(job.key), attempts=1)
+    with pytest.raises(ConfigError, match=f"plan: .*{told}"):
+        Store(config(**planned_first | changes, resume=True))
+    accepted = config(**planned_first | changes, resume=True, accept_changes=True)
+    with Store(accepted) as store:
+        store.begin_run(accepted, {})
+        found = Results.load(accepted.out)
+    assert {change.subject for change in found.accepted_changes} == {"plan"}
+
+
+def test_resuming_a_folder_without_results_says_so(config: Config, caplog: pytest.LogCaptureFixture) -> None:
+    Store(config(resume=True)).close()
+    assert "has no results to resume" in caplog.text
+
+
+@pytest.mark.parametrize(
     "change", [{"episodes": 50}, {"seeds": [0, 100]}, {"video": "all"}, {"envs": [LINE, OTHER_LINE]}]
 )
 def test_more_of_the_same_is_resumed(config: Config, change: dict[str, object]) -> None:
@@ -185,7 +216,9 @@ def test_what_is_not_planned_any_more_is_kept_and_not_counted(config: Config) ->
         store.begin_run(config(), {})
         for job in planned(config())[::2]:  # those that happened to come back first
             store.record(done(job.key), attempts=1)
-    with Store(config(episodes=3, resume=True)) as store:
+    with pytest.raises(ConfigError, match=r"plan: .*episodes was 6, is 3"):
+        Store(config(episodes=3, resume=True))
+    with Store(config(episodes=3, resume=True, accept_changes=True)) as store:
         store.begin_run(config(episodes=3), {})
         [cell] = Results.load(config().out).cells
         assert [(one.result.key.episode, one.counts) for one in cell.episodes] == [(0, True), (2, True), (4, False)]

@@ -62,19 +62,20 @@ class Section(NamedTuple):
         return self.title.lower().replace(" ", "-")
 
 
-def write_report(results: Results, path: Path, *, inline: bool = False) -> Path:
+def write_report(results: Results, path: Path, *, inline: bool = False, accept_changes: bool = False) -> Path:
     """Write the report of one folder, or of several (`combined`), to the HTML file `path`, whole or not at all.
 
     With `inline`, videos are in the page, up to `episodes.BUDGET` bytes; others are links, relative to `path`. Missing
-    folders are made. Returns `path`.
+    folders are made. With `accept_changes`, policies are compared although something changed between them (`compare`),
+    and the page shows these changes. Returns `path`.
     """
-    text = report(summarize(results), Gallery(results, path, inline=inline))
+    text = report(summarize(results), Gallery(results, path, inline=inline), accept_changes=accept_changes)
     with storing(path.parent), whole(path) as part:
         part.write_text(text, encoding="utf-8")
     return path
 
 
-def report(summary: Summary, gallery: Gallery) -> str:
+def report(summary: Summary, gallery: Gallery, *, accept_changes: bool = False) -> str:
     results, total = summary.results, summary.total
     figures = [
         _solved(summary),
@@ -84,7 +85,7 @@ def report(summary: Summary, gallery: Gallery) -> str:
     ]
     sections = [
         Section("Success", "success", success_table(summary)),
-        Section("Comparison", "comparison", compare_all(summary)),
+        Section("Comparison", "comparison", compare_all(summary, accept_changes=accept_changes)),
         Section("Gap to the synchronous score", "real_time", totals(clock_gaps(results))),
         Section("Learning curve", "learning_curve", learning_curves(summary)),
         Section("Latency", "latency", latency(summary)),

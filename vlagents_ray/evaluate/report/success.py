@@ -5,8 +5,10 @@ from __future__ import annotations
 import itertools
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 from vlagents_ray.evaluate.report.charts import Glyph, RateChart, Series, difference_glyph, rate_chart
+from vlagents_ray.evaluate.results.changes import Change
 from vlagents_ray.evaluate.results.comparison import Comparison, Line, comparable, comparisons
 from vlagents_ray.evaluate.results.reader import CellResults, Results, by_timing, rate_of
 from vlagents_ray.evaluate.results.statistics import ERROR_RATE, Pairs, Rate
@@ -176,28 +178,63 @@ class Comparisons:
     left_out: int  # pairs beyond the main ones, if there are very many
     several_timings: bool
     reasons: list[str]  # reasons why other pairs are not compared
+    changes: list[Change]  # accepted differences between environments of compared policies
 
 
-def compare_all(summary: Summary) -> Comparisons | None:
-    """Return all comparisons; None for a single policy id."""
-    if len(summary.results.contenders) < 2:
-        return None
-    reasons: list[str] = []
-    parts, left_out = [], 0
-    timings = by_timing(summary.results.cells)
-    for timing, cells in timings.items():
+@dataclass(frozen=True, slots=True)
+class Family:
+    """The comparisons of the episodes with one timing, whose p-values are adjusted for one another."""
+
+    timing: str
+    comparisons: list[Comparison]  # the main ones first
+    main: int  # the number of these
+    left_out: int  # pairs beyond the main ones, if there are very many; their number is in the adjustment
+    reasons: list[str]  # reasons why other pairs are not compared
+
+
+def families(summary: Summary, *, accept_changes: bool = False) -> list[Family]:
+    """Compare all policy ids, apart for each timing; of very many pairs only the main ones."""
+    found = []
+    for timing, cells in by_timing(summary.results.cells).items():
         results = summary.results.among(cells)
         every = list(itertools.combinations(results.contenders, 2))
         wanted = every if len(every) <= MOST_COMPARED else _asked_first(summary, every)
-        left_out += len(every) - len(wanted)
-        pairs, why = comparable(results, wanted)
-        reasons += why
+        pairs, reasons = comparable(results, wanted, accept_changes=accept_changes)
         asked = _asked_first(summary, pairs)
-        found = comparisons(results, [*asked, *(one for one in _later_first(results, pairs) if one not in asked)])
-        shown, folded = (found, []) if len(found) <= MOST_PAIRS else (found[: len(asked)], found[len(asked) :])
+        ordered = [*asked, *(pair for pair in _later_first(results, pairs) if pair not in asked)]
+        # Whether a pair is the main one depends on the rates, so the adjustment is for all that could have been.
+        chosen_of = None if len(wanted) == len(every) else len(every)
+        compared = comparisons(results, ordered, chosen_of=chosen_of, accept_changes=accept_changes)
+        found.append(Family(timing, compared, len(asked), len(every) - len(wanted), reasons))
+    return found
+
+
+def families_json(summary: Summary, *, accept_changes: bool = False) -> list[dict[str, Any]]:
+    """Return the comparisons of the page for JSON, each with its timing."""
+    found = families(summary, accept_changes=accept_changes)
+    return [one.to_json() | {"timing": family.timing} for family in found for one in family.comparisons]
+
+
+def compare_all(summary: Summary, *, accept_changes: bool = False) -> Comparisons | None:
+    """Return all comparisons; None for a single policy id."""
+    if len(summary.results.contenders) < 2:
+        return None
+    parts: list[ComparisonPart] = []
+    found = families(summary, accept_changes=accept_changes)
+    for family in found:
+        shown, folded = family.comparisons, family.comparisons[:0]
+        if len(shown) > MOST_PAIRS:
+            shown, folded = shown[: family.main], shown[family.main :]
         by_suite = [[_difference(one, line) for line in one.suites] for one in shown if one.suites]
-        parts.append(ComparisonPart(timing, totals(shown), by_suite, totals(folded)))
-    return Comparisons(parts, left_out, len(timings) > 1, reasons)
+        parts.append(ComparisonPart(family.timing, totals(shown), by_suite, totals(folded)))
+    changes = [change for family in found for one in family.comparisons for change in one.changes]
+    return Comparisons(
+        parts,
+        sum(family.left_out for family in found),
+        len(found) > 1,
+        [reason for family in found for reason in family.reasons],
+        list(dict.fromkeys(changes)),
+    )
 
 
 def totals(found: Sequence[Comparison]) -> list[Difference]:

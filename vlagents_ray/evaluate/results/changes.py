@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 from vlagents_ray.evaluate.plan.config import fingerprint
 
@@ -12,6 +12,13 @@ IDENTITY = ("policy", "checkpoint", "weights")  # of a policy's metadata
 _SWEPT = "checkpoint: "  # prefix of a file that each step of a sweep has
 _DIGITS = 12  # of a digest that a person reads
 MIX = "bring the old files back, give a new folder (--out), or mix both and have the report say so (--accept-changes)"
+
+
+class EnvStatement(NamedTuple):
+    """The description and the contract of an environment, as JSON values; empty if no worker has made it."""
+
+    description: Mapping[str, Any]  # `EvalEnv.describe()`, such as the simulator's version
+    contract: Mapping[str, Any]
 
 
 @dataclass(frozen=True, slots=True)
@@ -22,6 +29,11 @@ class Change:
     name: str  # of the file or the setting
     was: str | None  # its digest; None if there was none
     now: str | None
+
+    def is_statement_of(self, env: str) -> bool:
+        """Return whether the description or the contract of this env changed (`env_changes`)."""
+        kinds = tuple(f"its {kind} " for kind in EnvStatement._fields)
+        return self.subject == f"env {env}" and self.name.startswith(kinds)
 
     def __str__(self) -> str:
         return f"{self.subject}: {self.name} was {_short(self.was)}, is {_short(self.now)}"
@@ -38,6 +50,21 @@ def program_changes(subject: str, was: Mapping[str, str] | None, now: Mapping[st
         return []
     names = sorted(name for name in was.keys() | now.keys() if was.get(name) != now.get(name))
     return [Change(subject, name, was.get(name), now.get(name)) for name in names]
+
+
+def env_changes(env: str, was: EnvStatement, now: EnvStatement) -> list[Change]:
+    """Compare what an environment states about itself; no changes are known if it has stated nothing."""
+    changes: list[Change] = []
+    for kind in EnvStatement._fields:
+        before, after = getattr(was, kind), getattr(now, kind)
+        if not before or not after:
+            continue
+        names = sorted(name for name in before.keys() | after.keys() if before.get(name) != after.get(name))
+        changes += [
+            Change(f"env {env}", f"its {kind} {name!r}", repr(before.get(name)), repr(after.get(name)))
+            for name in names
+        ]
+    return changes
 
 
 def changed(known: Mapping[str, Any], now: Mapping[str, Any], *, swept: bool) -> str | None:

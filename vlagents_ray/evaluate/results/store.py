@@ -7,6 +7,7 @@ exactly once. Read it with `vlagents_ray.evaluate.results.reader`.
 from __future__ import annotations
 
 import json
+import logging
 import os
 import sqlite3
 import time
@@ -25,7 +26,9 @@ from vlagents_ray.evaluate.plan.jobs import Job
 from vlagents_ray.evaluate.results.changes import (
     MIX,
     Change,
+    EnvStatement,
     changed,
+    env_changes,
     listed,
     policy_changes,
     policy_program,
@@ -33,6 +36,8 @@ from vlagents_ray.evaluate.results.changes import (
     program_id,
 )
 from vlagents_ray.evaluate.results.database import FILE, RUNNING, WAIT_S, create, insert, lock, require_readable
+
+log = logging.getLogger(__name__)
 
 
 class Store(AbstractContextManager["Store"]):
@@ -220,17 +225,16 @@ class Store(AbstractContextManager["Store"]):
         if cell.place in self._made:  # by another worker of this run; descriptions may differ between nodes
             return
         self._made.add(cell.place)
-        query = "SELECT described, contract FROM cells WHERE cell = ? AND described IS NOT NULL"
-        if (known := self._db.execute(query, (cell.fingerprint,)).fetchone()) is None:
-            return
-        now = (json.loads(json.dumps(made.described, default=str)), json.loads(canonical(made.contract)))
-        odd = [
-            Change(f"env {cell.env}", f"{what} {name!r}", repr(old.get(name)), repr(new[name]))
-            for what, old, new in zip(("its description", "its contract"), map(json.loads, known), now, strict=True)
-            for name in new
-            if old.get(name) != new[name]
-        ]
-        self._accept_or_raise(cell.place, odd, "the environment is not that of the results in")
+        now = EnvStatement(json.loads(json.dumps(made.described, default=str)), json.loads(canonical(made.contract)))
+        changes: dict[Change, None] = {}
+        for other in self.cells:  # also those of other policies, which are compared with this one
+            if other.place != cell.place:
+                continue
+            query = "SELECT described, contract FROM cells WHERE cell = ? AND described IS NOT NULL"
+            if (known := self._db.execute(query, (other.fingerprint,)).fetchone()) is not None:
+                was = EnvStatement(*map(json.loads, known))
+                changes |= dict.fromkeys(env_changes(cell.env, was, now))
+        self._accept_or_raise(cell.place, list(changes), "the environment is not that of the results in")
 
     def note_policy(self, name: str, metadata: dict[str, Any]) -> None:
         """Record the metadata of a policy's server; raises `ConfigError` if it is another policy than before."""
@@ -257,7 +261,7 @@ class Store(AbstractContextManager["Store"]):
                 create(db)
             require_readable(self._out, db)
             self._require_resumable(db, config)
-            stop = config.stop.model_dump_json() if config.stop else None
+            stop = _rule(config)
             with db:
                 for cell in self.cells:
                     identity = (cell.policy.name, cell.step, cell.suite.name, cell.env)
@@ -277,6 +281,8 @@ class Store(AbstractContextManager["Store"]):
     def _require_resumable(self, db: sqlite3.Connection, config: EvalConfig) -> None:
         runs, episodes = (db.execute(f"SELECT COUNT(*) FROM {table}").fetchone()[0] for table in ("runs", "episodes"))  # noqa: S608
         causes = {cause for (cause,) in db.execute("SELECT DISTINCT cause FROM attempts")}
+        if not runs and config.resume:
+            log.warning("%s: has no results to resume (--resume), so that the evaluation begins there", self._out)
         if not runs or (not episodes and causes == {"user"}):
             with db:
                 for table in ("attempts", "cells", "policies", "workers", "runs"):
@@ -293,7 +299,7 @@ class Store(AbstractContextManager["Store"]):
                 f"{self._out} has results of other settings:\n{odd}\n"
                 f"take the old settings, or choose another out folder"
             )
-        lacking, programs = self._other_plan(db), dict[Change, None]()
+        lacking, programs = self._other_plan(db, config), dict[Change, None]()
         for cell in self.cells:
             query = "SELECT program FROM cells WHERE env = ? AND program IS NOT NULL AND cell = ?"
             if (row := db.execute(query, (cell.env, cell.fingerprint)).fetchone()) is not None:
@@ -302,23 +308,53 @@ class Store(AbstractContextManager["Store"]):
             "plan",
             lacking,
             "this plan is not that of the results in",
-            "plan these, too; give a new folder (--out); or add to the results and have the report say so "
+            "plan all of it; give a new folder (--out); or go on with this plan and have the report say so "
             "(--accept-changes)",
         )
         self._accept_or_raise("program", list(programs), "the environment is not that of the results in")
 
-    def _other_plan(self, db: sqlite3.Connection) -> list[Change]:
-        """Return the cells of the results that this plan lacks; a plan may grow, also by steps of a policy.
+    def _other_plan(self, db: sqlite3.Connection, config: EvalConfig) -> list[Change]:
+        """Return the cells and episodes of the results that this plan lacks, and other rules of early stopping.
 
-        A trainer evaluates versions of policies one after the other into one folder, each with its plan, so cells of
-        other policies are not missing.
+        A plan may grow, also by steps of a policy, which `--watch` adds one after the other. A trainer evaluates
+        versions of policies one after the other into one folder, each with its plan, so cells of other policies are
+        not missing.
         """
         trained = all(cell.policy.pushed_weights for cell in self.cells)
         policies = {cell.policy.name for cell in self.cells}
         mine = {(cell.policy.name, cell.suite.name, cell.env) for cell in self.cells}
         rows = db.execute("SELECT DISTINCT policy, suite, env FROM cells WHERE cell IN (SELECT cell FROM episodes)")
         gone = [" ".join(filter(None, row)) for row in rows if row not in mine and (row[0] in policies or not trained)]
-        return [Change("plan", name, "in it", None) for name in gone]
+        changes = [Change("plan", name, "in it", None) for name in gone]
+        rule = _rule(config)
+        for cell in self.cells:
+            query = "SELECT planned, seeds, stop FROM cells WHERE cell = ?"
+            if (row := db.execute(query, (cell.fingerprint,)).fetchone()) is not None:
+                changes += _plan_changes(cell, rule, *row)
+        return changes
+
+
+def _rule(config: EvalConfig) -> str | None:
+    """Return the rule of early stopping as the table of cells has it."""
+    return config.stop.model_dump_json() if config.stop else None
+
+
+def _plan_changes(cell: EvalCase, rule: str | None, planned: int, seeds_json: str, stop: str | None) -> list[Change]:
+    """Return what the plan of a cell leaves out of the results, or another rule of early stopping than `stop`.
+
+    Otherwise an evaluation could end where its rate looks good.
+    """
+    seeds = json.loads(seeds_json)
+    episodes = planned // len(seeds)
+    name = " ".join(filter(None, cell.name))
+    changes = []
+    if cell.suite.episodes < episodes:
+        changes.append(Change("plan", f"{name}: episodes", str(episodes), str(cell.suite.episodes)))
+    if len(cell.suite.seeds) < len(seeds):
+        changes.append(Change("plan", f"{name}: seeds", str(seeds), str(cell.suite.seeds)))
+    if stop != rule:
+        changes.append(Change("plan", f"{name}: early stopping", str(stop), str(rule)))
+    return changes
 
 
 def _differences(db: sqlite3.Connection, cell: EvalCase) -> list[str]:

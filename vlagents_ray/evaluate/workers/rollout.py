@@ -306,6 +306,14 @@ def _agent(config: EvalConfig, own: Mapping[str, Callable[[], Agent]], rank: Ran
     )
 
 
+def factory_programs(config: EvalConfig, own: OwnAgents) -> dict[str, Program]:
+    """Return the files of the agents that are made in the workers, by policy; served policies state theirs."""
+    if callable(own):
+        program = factory_program(own)
+        return {policy.name: program for policy in config.policies}
+    return {name: factory_program(make) for name, make in (own or {}).items()}
+
+
 def factory_program(make: Callable[[], Agent]) -> Program:
     """Return the files of the module that defines `make`, and those that the arguments of a `partial` name."""
     settings: dict[str, Any] = {}
