@@ -98,7 +98,10 @@ class RerunRecordings:
                 ) from error
             self._rerun.unregister_shutdown()  # it would wait forever for a viewer that has gone
         else:
-            self._folder.mkdir(parents=True, exist_ok=True)
+            try:
+                self._folder.mkdir(parents=True, exist_ok=True)
+            except OSError as error:
+                raise ConfigError(f"viewer {target}: {error}; want a folder that can be written to") from error
 
     def begin(self, name: str, instruction: str) -> RerunEpisode:
         """Begin an episode; `name` is also the name of its file, and an empty `instruction` is not shown."""

@@ -441,3 +441,189 @@ def test_options_are_checked_before_a_server_is_asked(
 def test_an_address_that_is_none_is_refused(capsys: pytest.CaptureFixture[str]) -> None:
     assert drive(["nonsense"]) == 2
     assert "want http(s)://" in capsys.readouterr().err
+
+
+ON_AN_ARM = """
+import sys
+import numpy as np
+import vlagents_ray.cli.robot as command
+from vlagents_ray import Act, ActionSpec, Agent, Contract, Obs
+
+class Still(Agent):
+    contract = Contract(action=ActionSpec(dim=2, delta=False))
+    transport = "local"
+
+    def __init__(self, *_, **__): ...
+
+    def act(self, obs):
+        return Act(np.zeros((8, 2), np.float32))
+
+class Arm:
+    applied = 0
+
+    def observe(self):
+        return Obs(state={"joints": np.zeros(2, np.float32)})
+
+    def apply(self, action):
+        Arm.applied += 1
+        if Arm.applied == 3:
+            print("the arm moves", flush=True)
+
+    def stop(self):
+        print(f"the arm stops after {Arm.applied}", flush=True)
+
+    def close(self):
+        print(f"closed after {Arm.applied}", flush=True)
+
+class Leader:
+    def engaged(self):
+        return False
+
+    def action(self, obs):
+        return np.zeros(2, np.float32)
+
+sys.modules["arm"] = sys.modules["__main__"]
+command.RemoteAgent = Still
+sys.exit(command.main(["http://gpu-box:8000", "--robot", "arm:Arm", "--seconds", "60", *sys.argv[1:]]))
+"""
+
+
+@pytest.mark.parametrize(
+    ("wish", "status"), [(signal.SIGINT, 130), (signal.SIGTERM, 128 + signal.SIGTERM), (signal.SIGHUP, 129)]
+)
+def test_a_signal_ends_a_run_on_an_arm_with_its_table_and_its_recording(
+    tmp_path: Path, wish: signal.Signals, status: int
+) -> None:
+    words = ["--record", str(tmp_path / "demos"), "--leader", "arm:Leader"]
+    with at_a_terminal(ON_AN_ARM, *words) as (process, _, lines):
+        until(lines, "the arm moves")
+        process.send_signal(wish)
+        said = list(lines)
+        assert process.wait(30) == status
+    text = "\n".join(said)
+    assert "Traceback" not in text
+    assert "within 2 ms" in text, "the table"
+    assert f"recorded: 1 episodes in {tmp_path / 'demos'}" in text
+    assert text.index("the arm stops") < text.index("closed")
+    assert frames(tmp_path / "demos", 0)["action"]
+
+
+@pytest.mark.parametrize(
+    ("key", "label", "status"), [("y", "success", 0), ("n", "failure", 0), ("q", "none", 0), ("x", None, 0)]
+)
+@pytest.mark.parametrize("leader", ["arm:Leader", "keyboard"])
+def test_the_keys_on_an_arm_are_named_at_the_start_and_end_and_label_the_run(
+    tmp_path: Path, leader: str, key: str, label: str | None, status: int
+) -> None:
+    words = ["--record", str(tmp_path / "demos"), "--leader", leader, "--step", "0.01", "--deadline-ms", "5000"]
+    with at_a_terminal(ON_AN_ARM, *words) as (process, press, lines):
+        until(lines, "keys: p pauses")
+        until(lines, "the arm moves")
+        press("p")
+        until(lines, "paused")
+        press("p")
+        until(lines, "the policy continues")
+        press(key)
+        said = "\n".join(lines)
+        assert process.wait(30) in (status, 1), "a tick without an action of the policy ends with 1"
+    assert "Traceback" not in said
+    stopped, closed = re.search(r"stops after (\d+)", said), re.search(r"closed after (\d+)", said)
+    assert stopped is not None
+    assert closed is not None
+    assert stopped[1] == closed[1], "nothing moved the arm after the key"
+    assert f"recorded: {int(label is not None)} episodes" in said
+    if label is not None:
+        assert labels(tmp_path / "demos") == [label]
+
+
+def test_without_a_terminal_the_command_says_so() -> None:
+    run = subprocess.run(
+        [sys.executable, "-c", ON_AN_ARM, "--seconds", "0.2"],
+        stdin=subprocess.DEVNULL, capture_output=True, text=True, timeout=60, check=False,
+    )  # fmt: skip
+    assert "keys: none, as there is no terminal" in run.stdout
+
+
+class FaultyArm(Served):
+    """An arm that cannot be made."""
+
+    def __init__(self, port: str = "") -> None:
+        raise OSError(f"[Errno 2] could not open port {port}")
+
+    observe = apply = stop = lambda *_: None
+
+
+class Unmade:
+    """A leader that needs arguments."""
+
+    def __init__(self, port: str) -> None: ...
+
+    def engaged(self) -> bool: ...  # type: ignore[empty-body]
+
+    def action(self, obs: Obs) -> np.ndarray: ...  # type: ignore[empty-body]
+
+
+HERE = f"{__name__}"
+ARM = ["--robot", SIMULATED]
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (["--hz", "1e9"], "--hz: got '1e9', want at most 10000"),
+        (["--hz", "inf"], "--hz: got 'inf', want at most 10000"),
+        (["--seconds", "inf"], "--seconds: got 'inf', want at most"),
+        (["--silent-s", "inf"], "--silent-s: got 'inf', want at most"),
+        (["--timeout-s", "1e300"], "want at most"),
+        (["--execute", "99999999999"], "want at most"),
+        (["--record", "/proc/x"], "recorder /proc/x: .*record into a new folder"),
+        (["--record", "{file}"], "recorder .*record into a new folder"),
+        (["--record", "{file}/below"], "recorder .*record into a new folder"),
+        (["--record", "{damaged}"], "recorder .*record into a new folder"),
+        (["--rerun", "{file}"], "{file}|rerun"),
+        (["--limits", "{file}"], "{file}|limits"),
+        (["--limits", "{folder}"], "limits"),
+        (["--limits", "/nowhere.yaml"], "nowhere"),
+        (["--trained-on", "{folder}", *ARM], "statistics"),
+        (["--ros", "{folder}"], "cannot be read as a file of ROS topics"),
+        (["--ros", "/nowhere.yaml"], "cannot be read as a file of ROS topics"),
+        ([*ARM, "--robot-set", "foo=1"], "unexpected keyword argument 'foo'; it takes"),
+        ([*ARM, "--robot-set", "foo"], "want KEY=VALUE"),
+        (["--robot", "{here}:FaultyArm", "--robot-set", "port=/dev/x"], "could not be made: OSError: .*port /dev/x"),
+        (["--robot", "{here}:FaultyArm", "--robot-set", "port=3"], "port: got 3, want str"),
+        (["--robot", "broken_syntax:Arm"], "SyntaxError: .*correct the module 'broken_syntax'"),
+        (["--robot", "raising_module:Arm"], "ZeroDivisionError: .*correct the module 'raising_module'"),
+        (["--robot", "lerobot:nothing"], "lerobot"),
+        (["--robot", ":Arm"], "--robot :Arm"),
+        (["--robot", "a..b:Arm"], "--robot a..b:Arm"),
+        (["--leader", "{here}:Unmade"], "--leader .*could not be made: TypeError"),
+        (["--leader", "builtins:dict"], "lacks engaged, action"),
+        (["--leader", "broken_syntax:Leader"], "SyntaxError"),
+        (["--measure", "elbow", *ARM, "--max-step", "1"], "elbow"),
+    ],
+)
+@pytest.mark.usefixtures("served")
+def test_each_wrong_argument_is_an_error_with_its_cure(
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    tmp_path: Path,
+    words: list[str],
+    said: str,
+) -> None:
+    modules = tmp_path / "modules"
+    modules.mkdir()
+    (modules / "broken_syntax.py").write_text("class Arm(:\n")
+    (modules / "raising_module.py").write_text("1 / 0\n")
+    monkeypatch.syspath_prepend(str(modules))
+    (tmp_path / "file").write_text("a file")
+    (tmp_path / "damaged/meta").mkdir(parents=True)
+    (tmp_path / "damaged/meta/info.json").write_text("{")
+    places = {name: str(tmp_path / name) for name in ("file", "damaged")} | {"folder": str(tmp_path), "here": HERE}
+    given = [word.format(**places) for word in words]
+    try:
+        status: object = drive([*SHORT, "--seconds", "0.05", *given])
+    except SystemExit as ended:
+        status = ended.code
+    error = capsys.readouterr().err
+    assert status == 2, error
+    assert re.search(said.format(**places), error, re.DOTALL), error

@@ -20,7 +20,7 @@ from functools import partial
 from typing import Any, get_args
 
 from vlagents_ray.chunking.buffer import ENSEMBLE, MERGES, Mode
-from vlagents_ray.chunking.control import Leader
+from vlagents_ray.chunking.control import Control, Leader
 from vlagents_ray.chunking.player import ChunkPlayer, PlayerSettings
 from vlagents_ray.client.agent import RemoteAgent
 from vlagents_ray.client.commands import CommandInbox
@@ -44,7 +44,7 @@ from vlagents_ray.robot.record import Recorder
 from vlagents_ray.robot.ros import RosRobot, read_settings
 from vlagents_ray.robot.safety import SOFT_START_S, Guard, Watchdog, measured_state
 from vlagents_ray.robot.simulated import SimulatedRobot
-from vlagents_ray.robot.teleoperation import HELP, AxesLeader, Keyboard, SpaceMouse, Terminal
+from vlagents_ray.robot.teleoperation import HELP, JOINTS_HELP, AxesLeader, Keyboard, SpaceMouse, Terminal
 from vlagents_ray.viewers import open_viewer
 
 logger = logging.getLogger(__name__)
@@ -52,6 +52,12 @@ MOSTLY_SAFE = 3  # exit status
 WAIT_S = 1.0  # deadline of a tick in the modes that wait for an answer; half of the default of --silent-s
 _DEVICES: dict[str, type[Keyboard | SpaceMouse]] = {"keyboard": Keyboard, "spacemouse": SpaceMouse}
 _HZ = 50.0  # of a robot
+_MOST_HZ = 10_000.0  # no arm and no loop in Python is faster
+_LABELS = {"y": "success", "n": "failure"}
+KEYS = (
+    "keys: p pauses and continues; y (success), n (failure), x (discard) and q end the run and stop the robot; "
+    "c or Enter restarts it after a stop"
+)
 RESTART_KEYS = "c\n"  # without Enter while the keyboard moves the robot
 _HEADER = ("", "ticks", "missed", "within 2 ms", "p50 ms", "p99 ms", "max ms")
 
@@ -70,6 +76,9 @@ def main(arguments: Sequence[str]) -> int:
     try:
         with _ended_by_signals():
             report = _run(options)
+    except KeyboardInterrupt:
+        print("interrupted", file=sys.stderr)  # noqa: T201
+        return 128 + signal.SIGINT
     except VLAgentsError as error:
         print(printable(f"{type(error).__name__}: {error}"), file=sys.stderr)  # noqa: T201
         return 2
@@ -100,16 +109,19 @@ def parse(arguments: Sequence[str]) -> argparse.Namespace:
 
 @contextlib.contextmanager
 def _ended_by_signals() -> Iterator[None]:
-    """End the loop at SIGTERM (systemd) and SIGHUP (a closed terminal) as at Ctrl-C, which stops the robot."""
+    """End the loop at SIGTERM (systemd), SIGHUP (a closed terminal) and Ctrl-C, which stops the robot."""
 
     def end(number: int, _: object) -> None:
         signal.signal(number, signal.SIG_IGN)  # a second signal would interrupt the stop
+        if number == signal.SIGINT:
+            raise KeyboardInterrupt
         sys.exit(128 + number)
 
     with contextlib.ExitStack() as undo:
         if threading.current_thread() is threading.main_thread():
-            for number in (signal.SIGTERM, signal.SIGHUP):
-                if signal.getsignal(number) == signal.SIG_DFL:  # nohup ignores it
+            for number in (signal.SIGTERM, signal.SIGHUP, signal.SIGINT):
+                # Else it is ignored, as SIGHUP by nohup, or the caller has its own handler.
+                if signal.getsignal(number) in (signal.SIG_DFL, signal.default_int_handler):
                     undo.callback(signal.signal, number, signal.signal(number, end))
         yield
 
@@ -121,7 +133,11 @@ def _run(options: argparse.Namespace) -> LoopReport:
     if options.deadline_ms is not None:
         deadline_s = options.deadline_ms / 1e3
     make_robot = robot_named("--robot", options.robot, options.robot_set) if options.robot else None
-    make_leader = import_class("--leader", options.leader) if ":" in (options.leader or "") else None
+    make_leader = None
+    if ":" in (options.leader or ""):
+        make_leader = import_class("--leader", options.leader, ("engaged", "action"))
+    ended: BaseException | None = None
+    report = LoopReport(hz)
     with contextlib.ExitStack() as stack:
         topics = None if options.ros is None else stack.enter_context(RosRobot(read_settings(options.ros)))
         commands = CommandInbox() if options.operate else None
@@ -158,24 +174,28 @@ def _run(options: argparse.Namespace) -> LoopReport:
             say(f"stopped by the watchdog: {reason}")
 
         watchdog = robot_watchdog(robot, stop, {"server": options.silent_s, "loop": hangs_s})
-        stack.enter_context(_restarting(watchdog, say))
-        report = run_loop(
-            robot, player, hz=hz, watchdog=watchdog, recorder=recorder, viewer=viewer, commands=commands,
-            instruction=options.instruction, seconds=options.seconds, restart=options.restart,
-            real_time=options.real_time, fit=fit,
-        )  # fmt: skip
+        keys = _RunKeys(recorder, say)
+        has_terminal = stack.enter_context(_restarting(watchdog, say, keys.press))
+        say(KEYS if has_terminal else "keys: none, as there is no terminal; SIGTERM ends the run, SIGUSR1 restarts it")
+        try:
+            run_loop(
+                robot, player, hz=hz, watchdog=watchdog, recorder=recorder, viewer=viewer, commands=commands,
+                instruction=options.instruction, seconds=options.seconds, restart=options.restart,
+                real_time=options.real_time, fit=fit, until=lambda: keys.over, report=report,
+            )  # fmt: skip
+        except BaseException as error:  # noqa: BLE001 - raised again below, after the report
+            ended = error
         if report.outcome:
-            say(f"marked as a {report.outcome} on the live page")
-        jitter = report.jitter
-        numbers = [f"{jitter['ticks']:.0f}", f"{jitter['missed']:.0f}", f"{100 * jitter['on_time']:.2f} %"]
-        times = (f"{jitter[key]:.3f}" for key in ("p50_ms", "p99_ms", "max_ms"))
-        for first, *cells in (_HEADER, (f"{options.mode}, {agent.transport}", *numbers, *times)):
-            say(f"{first:<20}" + "".join(f"{cell:>13}" for cell in cells))
-        _say_outcome(report, say, led=leader is not None)
+            say(f"marked as a {report.outcome}")
+        if report.jitter:
+            _say_table(report, f"{options.mode}, {agent.transport}", say)
+            _say_outcome(report, say, led=leader is not None)
     if recorder is not None:  # closed: everything is written
         say(f"recorded: {recorder.episodes} episodes in {options.record}, {recorder.dropped} frames dropped")
     if viewer is not None:
         say(viewer.report())
+    if ended is not None:
+        raise ended
     return report
 
 
@@ -207,15 +227,32 @@ def _leader(
     if options.leader is None:
         return None
     if make is not None:
-        leader = make()
+        try:
+            leader = make()
+        except VLAgentsError:
+            raise
+        except Exception as error:
+            raise ConfigError(
+                f"--leader {options.leader}: could not be made: {type(error).__name__}: {error}; want a class that is "
+                f"made without arguments"
+            ) from error
         return stack.enter_context(leader) if isinstance(leader, contextlib.AbstractContextManager) else leader
     if options.leader not in _DEVICES:
         raise ConfigError(f"--leader: got {options.leader!r}, want one of {list(_DEVICES)}, or MODULE:CLASS")
     device = _DEVICES[options.leader]()
     stack.enter_context(device)
     if isinstance(device, Keyboard):
-        print(f"{HELP}; C restarts the robot after a stop or a pause", flush=True)  # noqa: T201
+        of_joints = contract is not None and contract.action.space in (None, "joint") and not contract.action.relative
+        print(JOINTS_HELP if of_joints else HELP, flush=True)  # noqa: T201
     return AxesLeader(contract, device, step=options.step, measure=measured_state(options.measure))
+
+
+def _say_table(report: LoopReport, name: str, say: Callable[[str], None]) -> None:
+    jitter = report.jitter
+    numbers = [f"{jitter['ticks']:.0f}", f"{jitter['missed']:.0f}", f"{100 * jitter['on_time']:.2f} %"]
+    times = (f"{jitter[key]:.3f}" for key in ("p50_ms", "p99_ms", "max_ms"))
+    for first, *cells in (_HEADER, (name, *numbers, *times)):
+        say(f"{first:<20}" + "".join(f"{cell:>13}" for cell in cells))
 
 
 def _say_outcome(report: LoopReport, say: Callable[[str], None], *, led: bool) -> None:
@@ -234,9 +271,42 @@ def _say_outcome(report: LoopReport, say: Callable[[str], None], *, led: bool) -
     say(f"against jitter: {', '.join(report.means)}")
 
 
+class _RunKeys:
+    """The operator's keys at the terminal of a run on a robot. A key that ends the run also stops the robot."""
+
+    def __init__(self, recorder: Recorder | None, say: Callable[[str], None]) -> None:
+        self.over = False  # whether the operator ended the run
+        self._recorder = recorder
+        self._say = say
+
+    def press(self, key: str, control: Control) -> bool:
+        """Do what a key means; return whether it has a meaning."""
+        if key == "p" and control.reason is None:
+            control.pause()
+            self._say("paused; p continues")
+        elif key == "p":
+            control.resume()
+            self._say("the policy continues")
+        elif key in _LABELS:
+            control.mark(_LABELS[key])
+        elif key in ("x", "q"):
+            if key == "x" and self._recorder is not None:
+                self._recorder.label("discard")
+            control.stop(f"{key} at the keyboard")
+            self.over = True
+        else:
+            return False
+        return True
+
+
 @contextlib.contextmanager
-def _restarting(watchdog: Watchdog, say: Callable[[str], None]) -> Iterator[None]:
-    """Restart motion after a stop or a pause by the operator: Enter or C at the terminal, or SIGUSR1."""
+def _restarting(
+    watchdog: Watchdog, say: Callable[[str], None], press: Callable[[str, Control], bool] = lambda *_: False
+) -> Iterator[bool]:
+    """Restart motion after a stop or a pause by the operator: Enter or C at the terminal, or SIGUSR1.
+
+    Other keys are passed to `press`. Yields whether there is a terminal.
+    """
 
     def restarted() -> bool:
         if not watchdog.restart():
@@ -246,7 +316,7 @@ def _restarting(watchdog: Watchdog, say: Callable[[str], None]) -> Iterator[None
 
     def typed(key: str) -> bool:
         if key not in RESTART_KEYS:
-            return False
+            return press(key, watchdog.control)
         stood = watchdog.control.stopped or watchdog.control.reason is not None
         if not restarted():
             say(f"not restarted: still no signal from the {' and the '.join(watchdog.control.silent)}")
@@ -255,20 +325,29 @@ def _restarting(watchdog: Watchdog, say: Callable[[str], None]) -> Iterator[None
         return True
 
     with contextlib.ExitStack() as undo:
+        has_terminal = False
         with contextlib.suppress(ConfigError):  # there is no terminal
-            undo.enter_context(Terminal().read_in_background(typed))
+            terminal = Terminal()
+            undo.enter_context(terminal.keys_at_once())
+            undo.enter_context(terminal.read_in_background(typed))
+            has_terminal = True
         if threading.current_thread() is threading.main_thread() and hasattr(signal, "SIGUSR1"):
             before = signal.signal(signal.SIGUSR1, lambda *_: restarted() and None)
             undo.callback(signal.signal, signal.SIGUSR1, before)
-        yield
+        yield has_terminal
 
 
-def _number(kind: type[float] | type[int] = float, *, least: float = 0, above: bool = False) -> Callable[[str], float]:
-    """Return a function with which argparse reads a number not below `least`, or above it."""
+def _number(
+    kind: type[float] | type[int] = float, *, least: float = 0, above: bool = False, most: float = 1e9
+) -> Callable[[str], float]:
+    """Return a function with which argparse reads a number not below `least`, or above it, and up to `most`."""
 
     def read(text: str) -> float:
         with contextlib.suppress(ValueError):
-            if (value := kind(text)) > least or (value == least and not above):
+            value = kind(text)
+            if (value > least or (value == least and not above)) and value > most:
+                raise argparse.ArgumentTypeError(f"got {text!r}, want at most {most:g}")
+            if value > least or (value == least and not above):
                 return value
         what = "a whole number" if kind is int else "a number"
         raise argparse.ArgumentTypeError(f"got {text!r}, want {what} {'above' if above else 'from'} {least:g}")
@@ -296,7 +375,7 @@ def command_parser() -> tuple[argparse.ArgumentParser, list[argparse.Action], li
         of_env.append(groups[1].add_argument(*names, **settings))
 
     add("policy", nargs="?", help="URL of its server; with --env also a registered policy, 'module:Class', or nothing")
-    add("--hz", type=seconds, help=f"control rate (default: {_HZ:g}, or the environment's)")
+    add("--hz", type=_number(above=True, most=_MOST_HZ), help=f"control rate (default: {_HZ:g}, or the environment's)")
     real("--seconds", type=seconds, default=60.0, help="how long (%(default)s)")
     real("--instruction", help="the task in words")
     real("--robot", metavar="MODULE:CLASS", help="your class, lerobot:TYPE or mujoco:ARM; default: a simulated one")

@@ -29,6 +29,7 @@ from vlagents_ray.robot.limits import Limits
 from vlagents_ray.robot.pacing import KEPT_TICKS, Pacer, jitter, undisturbed
 from vlagents_ray.robot.record import Recorder
 from vlagents_ray.robot.safety import Guard, Watchdog
+from vlagents_ray.settings import require_arguments
 from vlagents_ray.viewers import EpisodeViewer, LoopView
 
 Restart = Literal["manual", "auto"]
@@ -126,11 +127,13 @@ def import_class(option: str, name: str, methods: Sequence[str] = ()) -> Any:
         raise ConfigError(f"{option}: got {name!r}, want module:Class")
     try:
         found = getattr(importlib.import_module(module), attribute)
-    except (ImportError, AttributeError) as error:
+    except (ImportError, AttributeError, ValueError) as error:
         raise ConfigError(
             f"{option} {name}: {error}; go to the folder of its module ({os.getcwd()} is this one), add that to "
             f"PYTHONPATH, or install it"
         ) from error
+    except Exception as error:  # whatever the module raises, a syntax error among them
+        raise ConfigError(f"{option} {name}: {type(error).__name__}: {error}; correct the module {module!r}") from error
     if missing := [method for method in methods if not callable(getattr(found, method, None))]:
         raise ConfigError(f"{option} {name}: lacks {', '.join(missing)}; want a class with {', '.join(methods)}")
     return found
@@ -152,7 +155,9 @@ def robot_named(option: str, name: str, settings: Iterable[str] = ()) -> Callabl
             given[key] = value
     adapter, _, first = name.partition(":")
     first_argument = (first,) if adapter in _ADAPTERS else ()
-    return partial(import_class(option, _ADAPTERS.get(adapter, name), ROBOT), *first_argument, **given)
+    make = partial(import_class(option, _ADAPTERS.get(adapter, name), ROBOT), *first_argument)
+    require_arguments(f"{option} {name}", make, given)
+    return partial(make, **given)
 
 
 @contextlib.contextmanager
@@ -163,7 +168,11 @@ def opened(make: Callable[[], Robot]) -> Iterator[Robot]:
     except VLAgentsError:
         raise
     except Exception as error:
-        raise ConfigError(f"robot: {type(error).__name__}: {error}; it could not be made, see the log") from error
+        logger.info("robot: could not be made", exc_info=True)
+        raise ConfigError(
+            f"robot: could not be made: {type(error).__name__}: {error}; check its arguments (--robot-set), its cables "
+            f"and its power, or correct its class"
+        ) from error
     try:
         yield robot
     finally:
@@ -236,6 +245,7 @@ def run_loop(
     until: Callable[[], bool] = lambda: False,
     commands: CommandInbox | None = None,
     fit: Fit | None = None,
+    report: LoopReport | None = None,
 ) -> LoopReport:
     """Reset an agent and let it drive a robot at a fixed rate, until it is done or the time is over.
 
@@ -272,6 +282,7 @@ def run_loop(
             with a rest pose the robot goes there. Use `Watchdog.trip` or `Control.stop` for a stop.
         commands: The commands of the live page, from `RemoteAgent(url, commands=...)`: pause, stop, mark.
         fit: The comparison of policy and robot, for misfits that are accepted; default: `fit_of(agent, robot, limits)`.
+        report: A new report, which is also filled if the loop ends by an exception; by default one is made.
 
     Returns:
         The timing of the loop, and the reasons of the ticks without an action of the policy.
@@ -301,7 +312,7 @@ def run_loop(
         raise ConfigError(
             "recorder: got one without interventions for a player with override=; want Recorder(…, interventions=True)"
         )
-    report = LoopReport(hz)
+    report = report or LoopReport(hz)
     stops = len(control.stops)
     agent.initialize()
     own = agent.check if isinstance(agent.check, Guard) else None
@@ -332,8 +343,8 @@ def run_loop(
                 recorder.label("success" if report.outcome == "success" else "failure")
         finally:
             control.running = False
+            report.barks = control.stops[stops:]
             robot.stop()  # before the watchdog and the recorder end
-    report.barks = control.stops[stops:]
     if report.mostly_safe is not None:
         logger.warning("%s", report.mostly_safe)
     return report

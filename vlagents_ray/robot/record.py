@@ -42,14 +42,21 @@ class Recorder:
             and `policy_known` (bool), and episodes a label. A dataset that has these columns keeps them in any case.
 
     Raises:
-        ConfigError: The folder has other files, or a dataset of another rate or version, or without these columns.
+        ConfigError: The folder cannot be written to, or has other files, or a dataset of another rate or version, or
+            without these columns.
         MissingDependency: The extra "record" is not installed.
     """
 
     def __init__(self, root: str | Path, fps: float, *, frames: int = 100, interventions: bool = False) -> None:
         self.dropped = 0
         self.error: Exception | None = None  # the first error in writing
-        self._dataset = Dataset(Path(root), fps, interventions=interventions)
+        try:
+            self._dataset = Dataset(Path(root), fps, interventions=interventions)
+            Path(root).mkdir(parents=True, exist_ok=True)  # else the error would come with the first frame
+        except (OSError, ValueError, KeyError) as error:  # no such folder, no permission, or damaged files
+            raise ConfigError(
+                f"recorder {root}: {type(error).__name__}: {error}; record into a new folder that can be written to"
+            ) from error
         self._label: Label | None = None
         self._frames = frames
         # What the thread does next, given the running episode; each returns the one that runs then. None ends it.

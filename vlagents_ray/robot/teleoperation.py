@@ -144,6 +144,10 @@ HELP = (
     "w/s a/d r/f move along x, y, z and take over; u/o i/k j/l turn; space opens and closes the gripper; "
     "Enter takes over and gives back"
 )
+JOINTS_HELP = (
+    "w/s a/d r/f o/u i/k j/l move joints 1 to 6 and take over; space opens and closes the gripper; "
+    "Enter takes over and gives back"
+)
 
 
 class Keyboard(AxesDevice):
@@ -323,6 +327,9 @@ class Terminal:
         import termios
         import tty
 
+        if not self._is_in_foreground():  # else changing the terminal would suspend the process
+            yield
+            return
         before = termios.tcgetattr(self.descriptor)
         tty.setcbreak(self.descriptor)
         try:

@@ -211,7 +211,7 @@ def test_a_marked_episode_ends_the_robots_command(server: LiveServer, capsys: py
     assert post(server, {"session": session, "do": "failure"})[0] == 200
     thread.join(30)
     assert status in ([0], [1])  # safe actions while it connected
-    assert "marked as a failure on the live page" in capsys.readouterr().out
+    assert "marked as a failure" in capsys.readouterr().out
 
 
 def test_a_robot_that_has_not_opted_in_goes_on(server: LiveServer) -> None:
