@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import base64
 import contextlib
+import gc
+import logging
 import os
 import socket
 import struct
@@ -27,10 +29,13 @@ from vlagents_ray.client.agent import RemoteAgent
 from vlagents_ray.client.credentials import Credentials
 from vlagents_ray.client.transports.shm import ShmTransport
 from vlagents_ray.client.transports.websocket import Stream
-from vlagents_ray.errors import PolicyUnavailable, TooManyRequests, Unauthorized
+from vlagents_ray.errors import PolicyUnavailable, TooManyRequests, Unauthorized, VLAgentsError
+from vlagents_ray.images import jpeg_png
 from vlagents_ray.interface import Act, Agent, Obs
+from vlagents_ray.protocol import frame_layout
 from vlagents_ray.protocol.frames import decode_replies, encode_requests
 from vlagents_ray.protocol.messages import PROTOCOL_VERSION, Limits, Request
+from vlagents_ray.protocol.websocket_frames import ReceiveBuffer, frame_head
 from vlagents_ray.serve import periodic
 from vlagents_ray.serve.access import api_keys
 from vlagents_ray.serve.access.api_keys import NoKey
@@ -40,8 +45,10 @@ from vlagents_ray.serve.endpoints.access_middleware import AccessMiddleware
 from vlagents_ray.serve.endpoints.http import build_http_app
 from vlagents_ray.serve.endpoints.shm import ShmServer
 from vlagents_ray.serve.endpoints.websocket import WebSocketServer
+from vlagents_ray.serve.engine.admission import MessageAdmission
 from vlagents_ray.serve.engine.engine import Engine
 from vlagents_ray.serve.engine.sender import Sender
+from vlagents_ray.serve.requests import Message
 
 BASE = urlsplit("http://127.0.0.1")
 SLOW_S, IDLE_S = 0.4, 3.0  # where a test is about those; others hold though this process stands still
@@ -432,6 +439,101 @@ def test_a_probe_is_answered_without_a_session_and_a_broken_one_leaves_the_strea
         stream.send_bytes(encode_requests([Request("reset", Obs())]))
         assert decode_replies(stream.receive_bytes())[0].error is None
     assert not keyed.policy.acting.is_set()
+
+
+FAULTS = [
+    (Engine, "check"),
+    (Sender, "admission"),
+    (Sender, "send"),
+    (Sender, "throttled_s"),
+    (Sender, "release"),
+    (Message, "decoded"),
+    (Message, "frame"),
+    (Message, "packed"),
+    (MessageAdmission, "begin_message"),
+    (MessageAdmission, "begin"),
+    (MessageAdmission, "hold"),
+    (MessageAdmission, "decode_on_thread"),
+    (ReceiveBuffer, "parse"),
+    (websocket.WebSocketConnection, "_read"),
+    (websocket.WebSocketConnection, "_handshake"),
+    (websocket.WebSocketConnection, "_process"),
+    (websocket.WebSocketConnection, "_submit"),
+    (websocket.WebSocketConnection, "_hold_partial"),
+    (websocket.WebSocketConnection, "overdue"),
+    (websocket.WebSocketServer, "identify"),
+    (local.UnixConnection, "_read"),
+    (local.UnixConnection, "_submit"),
+    (local.UnixConnection, "_authenticate"),
+    (local.UnixConnection, "overdue"),
+]
+
+
+@pytest.fixture
+def no_records() -> Iterator[None]:
+    """No records of the log, whose tracebacks would refer to the messages."""
+    logging.disable(logging.CRITICAL)
+    yield
+    logging.disable(logging.NOTSET)
+
+
+def open_sockets() -> int:
+    """The number of sockets of this process."""
+    folder = "/proc/self/fd"
+    files = []
+    for name in os.listdir(folder):
+        with contextlib.suppress(FileNotFoundError):  # that of the folder itself
+            files.append(os.readlink(f"{folder}/{name}"))
+    return sum(file.startswith("socket:") for file in files)
+
+
+def frame_of(data: bytes) -> bytes:
+    """A frame without a mask of random bytes, of any size."""
+    return frame_head(len(data), bytes(4)) + data
+
+
+@pytest.mark.parametrize(("owner", "name"), FAULTS, ids=lambda value: getattr(value, "__name__", value))
+def test_an_unexpected_error_anywhere_ends_that_connection_and_nothing_else(
+    keyed: Replica, owner: type, name: str, monkeypatch: pytest.MonkeyPatch, no_records: None
+) -> None:
+    """It is raised in callbacks of sockets, of timers, and of the threads that decode and answer."""
+    keyed.known.add("arm", rate=4)
+    bystander = keyed.shm(keyed.known.add("lab"))
+    assert bystander.call([Request("reset", Obs())], 5)[0].error is None
+    port = keyed.own.address.port
+    large = jpeg_png.encode_jpeg(np.zeros((1100, 1100, 3), np.uint8))
+    seen = {"cameras": {"front": {"$": ["img", 0]}}}
+    decoded_on_a_thread = b"".join(frame_layout.pack({"op": "reset", "obs": seen}, [large]))
+    over_the_rate = [frame_of(encode_requests([Request("act", Obs())]))] * 6
+    part = frame_head(2**22, bytes(4)) + bytes(100_000)
+    messages = b"".join([RESET, frame_of(decoded_on_a_thread), *over_the_rate, part])
+    sockets = open_sockets()
+    raised = threading.Event()
+
+    def fail(*_: object, **__: object) -> None:
+        raised.set()
+        raise RuntimeError("injected")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(owner, name, fail)
+        for _attempt in range(3):
+            with socket.create_connection(("127.0.0.1", port)) as client, contextlib.suppress(OSError):
+                client.sendall(handshake(keyed.own.path, "Authorization: Bearer vlr_arm") + messages)
+                client.settimeout(0.3)
+                while client.recv(65536):
+                    pass
+            near = ShmTransport(keyed.local.address, Credentials("vlr_arm"))
+            with contextlib.suppress(VLAgentsError, OSError):  # whatever this client is answered
+                near.connect(1)
+                near.call([Request("reset", Obs({"front": np.zeros((1100, 1100, 3), np.uint8)}))], 0.3)
+            near.close()
+        assert raised.wait(10)
+    assert bystander.call([Request("reset", Obs())], 5)[0].error is None or name in ("release", "overdue")
+    wait_for(lambda: not keyed.own._clients and len(keyed.local._clients) <= 1, 20)
+    gc.collect()
+    wait_for(lambda: keyed.engine.admission.held == 0, 20)
+    wait_for(lambda: open_sockets() <= sockets, 20)
+    wait_for(lambda: "arm" not in keyed.known.keys._held, 20)
 
 
 def test_a_look_that_fails_is_followed_by_the_next(caplog: pytest.LogCaptureFixture) -> None:

@@ -11,6 +11,9 @@ from websockets.streams import StreamReader
 
 _SMALL_BYTES = 1024  # parts of a frame up to this size are copied, since a view of them may outlast the buffer
 _BINARY = 0x80 | Opcode.BINARY  # first byte of a message in one frame
+HEAD_BYTES = 14  # maximum size of a frame's head: two bytes, eight bytes of the size, and a mask of four bytes
+# A connection may send a control frame each second, 16 at once: for keep-alive, one in 20 s is usual.
+CONTROL_FRAMES_PER_S, CONTROL_FRAMES = 1.0, 16
 
 
 def frame_head(size: int, mask: bytes = b"") -> bytes:
@@ -21,6 +24,21 @@ def frame_head(size: int, mask: bytes = b"") -> bytes:
     if size < 2**16:
         return bytes((_BINARY, bit | 126)) + size.to_bytes(2, "big") + mask
     return bytes((_BINARY, bit | 127)) + size.to_bytes(8, "big") + mask
+
+
+def frame_size(head: bytes) -> int | None:
+    """Return the size of a frame with its head, in bytes; None if `head` is not the complete head."""
+    if len(head) < 2:
+        return None
+    mask_bytes = 4 if head[1] & 0x80 else 0
+    size = head[1] & 0x7F
+    size_bytes = {126: 2, 127: 8}.get(size, 0)
+    head_bytes = 2 + size_bytes + mask_bytes
+    if len(head) < head_bytes:
+        return None
+    if size_bytes:
+        size = int.from_bytes(head[2 : 2 + size_bytes], "big")
+    return head_bytes + size
 
 
 class ReceiveBuffer(StreamReader):

@@ -213,7 +213,7 @@ def test_who_does_not_wait_for_answers_fills_no_memory_and_gets_them_all(
 
     monkeypatch.setattr(Echo, "act", act)
     frames = [
-        encode_requests([Request("act", Obs({"front": np.full((64, 64, 3), i % 256, np.uint8)}), request_id=str(i))])
+        encode_requests([Request("act", Obs({"front": np.full((96, 96, 3), i % 256, np.uint8)}), request_id=str(i))])
         for i in range(1000)
     ]
     with connect(f"ws://127.0.0.1:{endpoint.address.port}{endpoint.address.path}", compression=None) as client:
@@ -224,7 +224,7 @@ def test_who_does_not_wait_for_answers_fills_no_memory_and_gets_them_all(
         (one,) = endpoint._clients
         wait_for(lambda: one._paused or not sending.is_alive())
         assert sending.is_alive()
-        assert endpoint.engine.queue.depth() < 400  # 256, and what was in the same read: 85 frames in 1 MiB
+        assert endpoint.engine.queue.depth() <= 256
         hurry.set()
         replies = [decode_replies(client.recv(10))[0] for _ in frames]
         sending.join(10)

@@ -28,6 +28,7 @@ from vlagents_ray.errors import ConfigError, Forbidden, TooManyRequests, Unautho
 from vlagents_ray.protocol.messages import RankName, is_loopback
 from vlagents_ray.serve.access.audit import Audit
 from vlagents_ray.serve.access.key_store import Key, parse_keys, read_text
+from vlagents_ray.serve.token_bucket import TokenBucket
 
 logger = logging.getLogger(__name__)
 
@@ -65,7 +66,8 @@ class Keys:
         """
         self._read, self._changed = read, changed
         self._keys: dict[bytes, Key] = {}
-        self._buckets: dict[str, _Bucket] = {}
+        self._buckets: dict[str, TokenBucket] = {}
+        self._unread_until: dict[str, float] = {}  # time before which the senders with a key are not read, s
         self._held: Counter[str] = Counter()  # number of connections, by the key's name
         self._checked = float("-inf")
         self._unreadable: float | None = None  # time since which the file is unreadable, s; None if it is readable
@@ -123,13 +125,15 @@ class Keys:
         """Count a request of `key`; raise `TooManyRequests` if the key is over its rate."""
         if key.rate is None:
             return
+        now = time.monotonic()
         with self._lock:
             bucket = self._buckets.get(key.name)
             if bucket is None or bucket.rate != key.rate:
-                bucket = self._buckets[key.name] = _Bucket(key.rate)
-            if (wait_s := bucket.take(time.monotonic())) > 0:
+                bucket = self._buckets[key.name] = TokenBucket(key.rate, now)
+                self._unread_until.pop(key.name, None)
+            if (wait_s := bucket.take(now)) > 0:
                 least_s, most_s = _THROTTLED_S
-                bucket.unread_until = time.monotonic() + min(most_s, max(least_s, wait_s))
+                self._unread_until[key.name] = now + min(most_s, max(least_s, wait_s))
         if wait_s > 0:
             error = TooManyRequests(f"key {key.name!r}: over {key.rate:g} requests a second; wait {wait_s:.2g} s")
             error.retry_after_s = wait_s
@@ -137,8 +141,7 @@ class Keys:
 
     def throttled_s(self, name: str) -> float:
         """Return the time for which the key's senders are not read, s; 0 unless one exceeded the key's rate."""
-        bucket = self._buckets.get(name)
-        return 0.0 if bucket is None else max(0.0, bucket.unread_until - time.monotonic())
+        return max(0.0, self._unread_until.get(name, 0.0) - time.monotonic())
 
     def hold(self, name: str, number: int, most: int | None) -> None:
         """Count `number` more connections of a key; over `most` count none and raise `TooManyRequests`."""
@@ -291,25 +294,6 @@ class Caller:
             raise Forbidden(f"key {self.name!r}: lacks the scope {scope!r}; use one of `keys new NAME --scope {scope}`")
         if not free:
             self._keys.take(key)
-
-
-class _Bucket:
-    """A token bucket with room for the tokens of one second, and for one token at least."""
-
-    def __init__(self, rate: float) -> None:
-        self.rate = rate  # requests/s
-        self._tokens = self._capacity = max(1.0, rate)
-        self._refilled = time.monotonic()
-        self.unread_until = 0.0  # time before which senders with the key are not read, s
-
-    def take(self, now: float) -> float:
-        """Take a token and return 0 if there is one; otherwise return the time until there is one, s."""
-        self._tokens = min(self._capacity, self._tokens + (now - self._refilled) * self.rate)
-        self._refilled = now
-        if self._tokens < 1:
-            return (1 - self._tokens) / self.rate
-        self._tokens -= 1
-        return 0.0
 
 
 def load_keys(file: str | None = None, environment: Mapping[str, str] = os.environ) -> Keys | None:

@@ -33,11 +33,14 @@ from vlagents_ray.serve.engine.engine import Engine
 from vlagents_ray.serve.engine.sender import Sender
 from vlagents_ray.serve.periodic import each_half_second
 from vlagents_ray.serve.requests import Message
+from vlagents_ray.serve.token_bucket import TokenBucket
 
 logger = logging.getLogger(__name__)
 
 BACKLOG = 128
-POLICY_VIOLATION = 1008  # WebSocket close code
+POLICY_VIOLATION, _INTERNAL_ERROR = 1008, 1011  # WebSocket close codes
+# Maximum number of connections that a server accepts in a second; each takes some time of the policy's thread.
+_ACCEPTED_PER_S = 200.0
 # Reasons for not polling a connection.
 DECODING, THROTTLED = "a frame is decoded on another thread", "the key is over its rate"
 
@@ -103,11 +106,31 @@ class PolledConnection(ABC):
 
     def ready(self) -> None:
         """Read the connection; the batch queue calls this."""
+        self._run(self._read)
+
+    def _run(self, callback: Callable[[], None]) -> None:
+        """Run a callback of the poller; an unexpected error ends this connection, and nothing else."""
         try:
-            self._read()
+            callback()
         except Exception:
             logger.exception("%s: disconnected a client after an error", self._name)
             self.disconnect()
+
+    def _call_soon(self, callback: Callable[[], None]) -> None:
+        """Schedule a callback on the polling thread; may be called on any thread."""
+        self._poller.call_soon(partial(self._run, callback))
+
+    def _call_later(self, seconds: float, callback: Callable[[], None]) -> None:
+        """Schedule a callback after `seconds`; call this on the polling thread."""
+        self._poller.call_later(seconds, partial(self._run, callback))
+
+    def _answer(self, message: Message) -> None:
+        """Send the answers of a message, on the thread of the last one; an unexpected error ends this connection."""
+        try:
+            self._write(message)
+        except Exception:
+            logger.exception("%s: disconnects a client whose answers cannot be sent", self._name)
+            self.end("its answers cannot be sent", _INTERNAL_ERROR)
 
     def _pause(self, reason: str) -> None:
         """Stop polling the connection until `_resume` is called with the same reason."""
@@ -127,7 +150,7 @@ class PolledConnection(ABC):
         if self._ended or self._sender is None or (wait_s := self._sender.throttled_s()) <= 0:
             return False
         self._pause(THROTTLED)
-        self._poller.call_later(wait_s, self._unthrottle)
+        self._call_later(wait_s, self._unthrottle)
         return True
 
     def _unthrottle(self) -> None:
@@ -148,8 +171,8 @@ class PolledConnection(ABC):
             decoded = read(admission)
         except NeedsDecodingThread:
             self._pause(DECODING)
-            then, poller = partial(self._decoded, message, submit), self._poller
-            admission.decode_on_thread(read).add_done_callback(lambda done: poller.call_soon(lambda: then(done.result)))
+            then = partial(self._decoded, message, submit)
+            admission.decode_on_thread(read).add_done_callback(lambda done: self._call_soon(partial(then, done.result)))
         else:
             submit(decoded)
 
@@ -161,9 +184,6 @@ class PolledConnection(ABC):
         except VLAgentsError as error:
             message.refuse(error)
             self._write(message)
-        except Exception:
-            logger.exception("%s: disconnected a client after an error", self._name)
-            self.disconnect()
         self._resume(DECODING)
 
     def overdue(self, now: float, refusal: Callable[[Caller], str | None]) -> tuple[str, int] | None:
@@ -192,13 +212,15 @@ class PolledConnection(ABC):
 
     def release(self) -> None:
         """End the sessions, and close the connection."""
-        if self._sender is not None:
-            self._sender.release()
-        with self._sending:
-            self._ended = True  # its descriptor's number may soon be reused
-            self._discard()
-            self._connection.close()
-        self._remove(self)
+        try:
+            if self._sender is not None:
+                self._sender.release()
+        finally:
+            with self._sending:
+                self._ended = True  # its descriptor's number may soon be reused
+                self._discard()
+                self._connection.close()
+            self._remove(self)
 
 
 C = TypeVar("C", bound=PolledConnection)
@@ -223,6 +245,7 @@ class PolledServer(ABC, Generic[C]):
         self.engine, self.limits, self.admit = engine, limits, admit
         self._clients: set[C] = set()
         self._listener = listener
+        self._accepting = TokenBucket(_ACCEPTED_PER_S, time.monotonic())
         # Without a free descriptor a client could not even be refused, and the listener would stay readable.
         self._spare = _descriptor()
 
@@ -244,7 +267,15 @@ class PolledServer(ABC, Generic[C]):
             client.release()
 
     def accept(self) -> None:
-        """Accept one client; errors (an aborted connection, EMFILE) never stop the listener, which is readable."""
+        """Accept one client; errors (an aborted connection, EMFILE) never stop the listener, which is readable.
+
+        Clients above the rate of `_ACCEPTED_PER_S` wait in the listener's backlog.
+        """
+        if (wait_s := self._accepting.take(time.monotonic())) > 0:
+            poller = self.engine.queue.poller
+            poller.unwatch(self._listener)
+            poller.call_later(wait_s, self._listen_again)
+            return
         try:
             connection, _ = self._listener.accept()
         except OSError as error:
@@ -262,6 +293,9 @@ class PolledServer(ABC, Generic[C]):
             logger.exception("a client was not let in")
             connection.close()
 
+    def _listen_again(self) -> None:
+        self.engine.queue.poller.watch(self._listener, self.accept)
+
     def close_overdue(self) -> None:
         """Close the connections that are overdue, or whose key is no longer valid; may be called on any thread."""
         now = time.monotonic()
@@ -277,8 +311,8 @@ class PolledServer(ABC, Generic[C]):
             client.caller.hold(-1)
 
     def _serve(self, client: C, connection: socket.socket) -> None:
-        self._clients.add(client)
         self.engine.queue.poller.watch(connection, client.ready)
+        self._clients.add(client)
 
 
 # The time that a message has waited in its socket, which may be seconds if the reading thread is busy.

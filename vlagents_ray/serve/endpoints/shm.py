@@ -173,7 +173,7 @@ class UnixConnection(PolledConnection):
             sender.count_message()
         decoded = Decoded(self._reader.read(text, memory), {})
         message.decoded(decoded)
-        sender.send(message, decoded, self._write, waited_s=waited_s)
+        sender.send(message, decoded, self._answer, waited_s=waited_s)
 
     def _submit(
         self, sender: Sender, message: Message, admission: MessageAdmission, waited_s: float, decoded: Decoded
@@ -181,7 +181,7 @@ class UnixConnection(PolledConnection):
         message.decoded(decoded)
         if DECODING in self._unpolled_for:
             waited_s += time.perf_counter() - message.arrived
-        sender.send(message, decoded, self._write, admission=admission, waited_s=waited_s)
+        sender.send(message, decoded, self._answer, admission=admission, waited_s=waited_s)
 
     def _unthrottle(self) -> None:
         if not self._ended and _has_hung_up(self._connection):  # its messages are not decoded, which would delay others

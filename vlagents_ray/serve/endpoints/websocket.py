@@ -38,7 +38,14 @@ from vlagents_ray.errors import (
 )
 from vlagents_ray.protocol import messages
 from vlagents_ray.protocol.frames import Decoded, decode_requests
-from vlagents_ray.protocol.websocket_frames import ReceiveBuffer, frame_head
+from vlagents_ray.protocol.websocket_frames import (
+    CONTROL_FRAMES,
+    CONTROL_FRAMES_PER_S,
+    HEAD_BYTES,
+    ReceiveBuffer,
+    frame_head,
+    frame_size,
+)
 from vlagents_ray.serve.access.api_keys import Caller, Identity, NoKey, token_of
 from vlagents_ray.serve.access.origin_check import require_own_page
 from vlagents_ray.serve.endpoints.connection import (
@@ -59,10 +66,13 @@ from vlagents_ray.serve.engine.admission import MessageAdmission, image_bytes
 from vlagents_ray.serve.engine.engine import Engine
 from vlagents_ray.serve.engine.sender import REFUSED, Sender
 from vlagents_ray.serve.requests import Message
+from vlagents_ray.serve.token_bucket import TokenBucket
 
 logger = logging.getLogger(__name__)
 
-_READ_BYTES = 1024 * 1024  # room for a message with two or three raw images
+_READ_BYTES = 1024 * 1024  # maximum size of a read; room for a message with two or three raw images
+_FRAMES_PER_READ = 16  # maximum number of frames that are read from a connection before others have their turn
+_DISCARD_BYTES = 64 * 1024  # maximum size of a read after an invalid message
 _SLOW_S = 10.0  # maximum time without progress for a client that does not read all replies at once
 _MAX_HANDSHAKES = 64  # maximum number of connections without a completed handshake
 _HANDSHAKE_BYTES = 16 * 1024  # maximum size of a handshake
@@ -164,8 +174,8 @@ class WebSocketServer(PolledServer["WebSocketConnection"]):
         if len(self._handshaking) >= _MAX_HANDSHAKES:
             next(iter(self._handshaking)).disconnect()
         client = WebSocketConnection(self, connection)
-        self._handshaking[client] = None
         self._serve(client, connection)
+        self._handshaking[client] = None
 
 
 class WebSocketConnection(PolledConnection):
@@ -178,6 +188,9 @@ class WebSocketConnection(PolledConnection):
         self._protocol = ServerProtocol(max_size=messages.STREAM_BYTES)  # guarded by the lock
         self._head = b""  # received part of the handshake
         self._refused_for_s = 0.0  # time after which the handshake is no longer over the rate of its key
+        self._frame_head = b""  # received part of a frame's head, until the head is complete
+        self._frame_left = 0  # unread bytes of the current frame, once its head is complete
+        self._control_frames = TokenBucket(CONTROL_FRAMES_PER_S, time.monotonic(), CONTROL_FRAMES)
         self._received = ReceiveBuffer(messages.STREAM_BYTES)
         self._out = SendBuffer(connection, self._sending, messages.STREAM_BYTES)
         self._paused = False  # whether too many messages are unanswered; guarded by the lock
@@ -193,41 +206,72 @@ class WebSocketConnection(PolledConnection):
         self._seen, self._quiet_since, self._part_since = 0, time.monotonic(), float("inf")
 
     def _read(self) -> None:
+        frames = 0
+        while self._read_part() and frames < _FRAMES_PER_READ:
+            frames += 1
+
+    def _read_part(self) -> bool:
+        """Read the handshake or a part of a frame; return whether more may be read, since a frame is complete."""
         if self._sender is not None and self._sender.rated and self._is_throttled():
-            return
+            return False
         data: bytes | memoryview
-        size = _HANDSHAKE_BYTES if self._sender is None else _READ_BYTES
+        closing = self._protocol.state is State.CLOSING
         try:
+            size = _DISCARD_BYTES if closing else self._bytes_to_read()
             data, control = read_buffer.receive(self._connection, size)
             self._arrived = time.perf_counter() - time_in_socket_s(control)
         except BlockingIOError:
-            return
+            return False
         except OSError as error:
             logger.info("stream client: %s", error)
             data = b""
-        if closing := self._protocol.state is State.CLOSING:
+        if closing:
             self._discarded += len(data)
         if self._ending or self._discarded > self._limits.body_bytes or not (data or (self._sender and not closing)):
             self.disconnect()
+        elif self._sender is None:
+            self._receive_handshake(data)
+        elif not closing:  # unread bytes would reset the connection before the client reads the close code
+            if self._frame_left:
+                self._frame_left -= len(data)
+            self._receive(data)
+            return not self._frame_left and self._polled and not self._ended
+        return False
+
+    def _receive_handshake(self, data: bytes | memoryview) -> None:
+        self._head += data
+        complete = self._head.endswith(_END_OF_HEADERS)
+        if not complete and len(self._head) <= _HANDSHAKE_BYTES:
             return
-        if closing:  # unread bytes would reset the connection before the client reads the close code
-            return
+        if not complete or not self._handshake(self._head):
+            self._refuse_handshake()
+        self._head = b""
+
+    def _bytes_to_read(self) -> int:
+        """Return how many bytes to read now: at most the handshake, and then at most one frame.
+
+        What follows stays in the socket until it is known whether the client may send more. Raises `BlockingIOError` if
+        the socket is empty.
+        """
         if self._sender is None:
-            self._head += data
-            end = self._head.find(_END_OF_HEADERS)
-            if end < 0 and len(self._head) <= _HANDSHAKE_BYTES:
-                return
-            head, data = self._head[: end + len(_END_OF_HEADERS)], self._head[end + len(_END_OF_HEADERS) :]
-            if end < 0 or not self._handshake(head):
-                self._refuse_handshake()
-                return
-            self._head = b""
-            if not data:
-                return
-        self._receive(data)
+            coming = self._connection.recv(_HANDSHAKE_BYTES, socket.MSG_PEEK)
+            overlap = self._head[1 - len(_END_OF_HEADERS) :]  # the mark may have arrived in parts
+            end = (overlap + coming).find(_END_OF_HEADERS)
+            return len(coming) or 1 if end < 0 else end + len(_END_OF_HEADERS) - len(overlap)
+        if not self._frame_left:
+            coming = self._connection.recv(HEAD_BYTES - len(self._frame_head), socket.MSG_PEEK)
+            head = self._frame_head + coming
+            size = frame_size(head)
+            if size is None:
+                self._frame_head = head
+                return len(coming) or 1  # reads the end of the connection
+            self._frame_left = size - len(self._frame_head)
+            self._frame_head = b""
+        return min(self._frame_left, _READ_BYTES)
 
     def _receive(self, data: bytes | memoryview) -> None:
-        """Process bytes that follow the handshake; empty `data` means that the connection has ended."""
+        """Process bytes of one frame; empty `data` means that the connection has ended."""
+        was_open = self._protocol.state is State.OPEN
         with self._sending:
             if data:
                 self._received.parse(data)
@@ -236,10 +280,18 @@ class WebSocketConnection(PolledConnection):
             events = self._protocol.events_received()
             self._flush()
         for event in events:
-            if isinstance(event, Frame) and event.opcode in (Opcode.BINARY, Opcode.TEXT, Opcode.CONT):
+            if not isinstance(event, Frame):
+                continue
+            if event.opcode in (Opcode.BINARY, Opcode.TEXT, Opcode.CONT):
                 self._messages += 1
                 self._frames.append((event, self._arrived, self._partial))
                 self._partial = None
+            elif self._control_frames.take(time.monotonic()) > 0:
+                self._charge_abuse()
+                self.end(f"more than {CONTROL_FRAMES} control frames at once")
+                return
+        if was_open and self._protocol.state is State.CLOSING and self._protocol.close_rcvd is None:
+            self._charge_abuse()  # an invalid frame, behind which up to `limits.body_bytes` are discarded
         self._process_frames()
         if self._received.size and self._sender is not None and not self._ended:
             self._hold_partial(self._sender)
@@ -250,6 +302,12 @@ class WebSocketConnection(PolledConnection):
             paused = self._paused = self._is_backlogged() and self._protocol.state is State.OPEN
         if paused:
             self._pause(_BACKLOGGED)
+
+    def _charge_abuse(self) -> None:
+        """Charge a message to the key, as for a message that is refused, before the connection ends."""
+        if self._sender is not None:
+            with contextlib.suppress(VLAgentsError):
+                self._sender.count_message()
 
     def _hold_partial(self, sender: Sender) -> None:
         """Count a partly received message for its key before the rest is read, and its bytes as they arrive."""
@@ -340,10 +398,12 @@ class WebSocketConnection(PolledConnection):
             with self._sending:
                 if not self._ended:
                     self._flush()
+                    with contextlib.suppress(OSError):  # closing a socket with unread bytes resets the connection
+                        self._connection.recv(_HANDSHAKE_BYTES)
             self.disconnect()
 
         if self._refused_for_s > 0:
-            self._poller.call_later(min(self._refused_for_s, _REFUSED_S), refuse)
+            self._call_later(min(self._refused_for_s, _REFUSED_S), refuse)
         else:
             refuse()
 
@@ -407,20 +467,20 @@ class WebSocketConnection(PolledConnection):
         sender.send(
             message,
             decoded,
-            partial(self._answer, size),
+            partial(self._answered, size),
             admission=admission,
             waited_s=waited_s if waited_s > LEAST_WAIT_S else 0.0,
         )
 
-    def _answer(self, size: int, message: Message) -> None:
+    def _answered(self, size: int, message: Message) -> None:
         with self._sending:
             self._unanswered -= 1
             self._unanswered_bytes -= size
             resume = self._paused and not self._is_backlogged()
             self._paused = self._paused and not resume
         if resume:
-            self._poller.call_soon(partial(self._resume, _BACKLOGGED))
-        self._send(message.frame())
+            self._call_soon(partial(self._resume, _BACKLOGGED))
+        self._answer(message)
 
     def _write(self, message: Message) -> None:
         self._send(message.frame())

@@ -282,9 +282,10 @@ class Engine:
             try:
                 self.check(pending)
                 ready.append(pending)
-            except VLAgentsError as error:
-                if not self._seek(pending, error):
-                    self._fail(pending, error)
+            except Exception as error:  # noqa: BLE001 - becomes the reply, and affects no other request
+                public = public_error(error, pending)
+                if not self._seek(pending, public):
+                    self._fail(pending, public)
         try:
             if ready:
                 self.queue.put(*ready)
@@ -387,8 +388,8 @@ class Engine:
             try:
                 self.check(pending)
                 self.queue.put(pending)
-            except VLAgentsError as again:
-                pending.fail(error if type(again) is type(error) else again)
+            except Exception as again:  # noqa: BLE001 - becomes the reply
+                pending.fail(error if type(again) is type(error) else public_error(again, pending))
 
         origin = pending.origin
         searcher = origin.owner if origin.caller is None else origin.caller.name

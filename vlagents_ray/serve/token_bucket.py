@@ -1,0 +1,28 @@
+"""A token bucket: the limit of a rate, with bursts."""
+
+from __future__ import annotations
+
+
+class TokenBucket:
+    """Tokens that are refilled at a rate. Not thread-safe."""
+
+    def __init__(self, rate: float, now: float, capacity: float | None = None) -> None:
+        """Create a full bucket.
+
+        Args:
+            rate: Tokens that are added each second.
+            now: The present time, s.
+            capacity: Maximum number of tokens; by default those of one second, and at least one.
+        """
+        self.rate = rate
+        self._tokens = self._capacity = max(1.0, rate) if capacity is None else capacity
+        self._refilled = now
+
+    def take(self, now: float) -> float:
+        """Take a token and return 0 if there is one; otherwise return the time until there is one, s."""
+        self._tokens = min(self._capacity, self._tokens + (now - self._refilled) * self.rate)
+        self._refilled = now
+        if self._tokens < 1:
+            return (1 - self._tokens) / self.rate
+        self._tokens -= 1
+        return 0.0
