@@ -17,6 +17,7 @@ from __future__ import annotations
 
 import contextlib
 import hashlib
+import json
 import math
 import tempfile
 import time
@@ -441,10 +442,10 @@ def limits_of(joints: int) -> Limits:
     )
     with tempfile.TemporaryDirectory() as folder:
         Path(folder, "arm.urdf").write_text(f"<robot name='arm'>{links}</robot>")
-        Path(folder, "arm.json").write_text('{"urdf": "arm.urdf", "tip": "7"}')
+        workspace = {"workspace_low": [-2.0, -2.0, -2.0], "workspace_high": [2.0, 2.0, 2.0]}
+        Path(folder, "arm.json").write_text(json.dumps({"urdf": "arm.urdf", "tip": "7", **workspace}))
         read = Limits.read(Path(folder, "arm.json"))
-    dynamics = replace(read, acceleration=LIMITS.acceleration, jerk=LIMITS.jerk)
-    return replace(dynamics, workspace_low=(-2.0, -2.0, -2.0), workspace_high=(2.0, 2.0, 2.0))
+    return replace(read, acceleration=LIMITS.acceleration, jerk=LIMITS.jerk)
 
 
 def tick_us(joints: int, ticks: int, *, part: str) -> list[float]:

@@ -456,6 +456,22 @@ def test_done_is_said_with_the_last_row_of_the_chunk_that_says_so(playing: Playi
     assert len(agent.seen) == 2
 
 
+@pytest.mark.parametrize("options", [{}, {"execute": 2}, {"horizon": 2}, {"execute": 1, "horizon": 3}], ids=str)
+@pytest.mark.parametrize(
+    "mode",
+    [{}, {"deadline_s": 30.0}, {"mode": "ensemble"}, {"mode": "async"}, {"mode": "async", "real_time_chunking": True}],
+    ids=str,
+)
+def test_a_chunk_with_done_is_executed_whole_in_every_mode(
+    playing: Playing, options: dict[str, Any], mode: dict[str, Any]
+) -> None:
+    agent, player = playing(Counting(rows=5, done_at=0), **options, **mode)
+    acts = [player.act(obs(t)) for t in range(5)]
+    assert [act.done for act in acts] == [False] * 4 + [True]
+    assert [float(act.action[0]) for act in acts] == pytest.approx([0, 0.1, 0.2, 0.3, 0.4])
+    assert len(agent.seen) == 1
+
+
 @pytest.mark.parametrize(
     "options",
     [

@@ -197,7 +197,9 @@ def test_a_file_of_limits_is_read_with_its_urdf(tmp_path: Path) -> None:
 
 def test_the_tip_is_where_the_chain_of_transforms_puts_it(tmp_path: Path) -> None:
     (tmp_path / "arm.urdf").write_text(URDF)
-    (tmp_path / "arm.json").write_text(json.dumps({"joints": ["lift", "pan"], "urdf": "arm.urdf", "tip": "tip"}))
+    (tmp_path / "arm.json").write_text(
+        json.dumps({"joints": ["lift", "pan"], "urdf": "arm.urdf", "tip": "tip", "workspace_low": [-1, -1, -1]})
+    )
     chain = Limits.read(tmp_path / "arm.json").chain
     assert chain is not None
     pan, lift = 0.7, -0.4

@@ -8,7 +8,7 @@ import threading
 import time
 from collections.abc import Callable
 from contextlib import ExitStack, suppress
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
@@ -28,7 +28,8 @@ from vlagents_ray.robot.record import Recorder
 
 HZ = 200.0
 EVENT_AT = 6  # the observation at which the robot is stopped
-REST = Limits(velocity=20.0, acceleration=2000.0, jerk=2e6, rest=(-0.5, -0.5))
+MOTION = Limits(velocity=20.0, acceleration=2000.0, jerk=2e6)  # deltas have no rest pose
+REST = replace(MOTION, rest=(-0.5, -0.5))
 WAY_TO_REST = -0.05  # targets below it are on the way to the rest pose; the policy's are above 0
 
 
@@ -167,7 +168,7 @@ def test_nothing_is_applied_after_a_stop(
     moment, relative, mode, led, recorded = setting
     arm, policy = Arm(), Policy(relative=relative)
     leader = ScriptedLeader(np.full(2, 0.001, np.float32), lambda: True) if led else None
-    guard = Guard(policy.contract, limits=REST, hz=HZ, soft_start_s=0.0)
+    guard = Guard(policy.contract, limits=MOTION if relative else REST, hz=HZ, soft_start_s=0.0)
     player = ChunkPlayer(policy, PlayerSettings(mode, deadline_s=0.0 if led else None), check=guard, override=leader)
     run = Run(arm, policy, Watchdog(lambda _: arm.stop(), {"loop": 0.3}))
     if moment == "driven":
@@ -229,8 +230,9 @@ MAX_STEPS = 20
 
 def blind_trial(tmp_path: Path, arm: Arm, person: Operator, policy: Policy, mode: Mode) -> None:
     limits = tmp_path / "limits.json"
-    stated = {"velocity": 20.0, "acceleration": 2000.0, "jerk": 2e6, "rest": [-0.5, -0.5]}
-    limits.write_text(json.dumps(stated))
+    stated = {"velocity": 20.0, "acceleration": 2000.0, "jerk": 2e6}
+    with_rest = {} if policy.contract.action.relative else {"rest": [-0.5, -0.5]}
+    limits.write_text(json.dumps(stated | with_rest))
     robot = {"arm": "x:Y", "hz": HZ, "limits": str(limits), "mode": mode, "silent_s": 30.0}
     tasks = {"cup": {"instruction": "lift the cup", "max_steps": MAX_STEPS}}
     config = EvalConfig.model_validate(

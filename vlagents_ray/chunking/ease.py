@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 
 
@@ -10,18 +12,24 @@ class EaseIn:
 
     For `approach` ticks the command goes straight to the first row, by the quintic of least jerk (Flash & Hogan 1985),
     at rest at both ends. Then the speed along the rows rises from zero to theirs within `ramp` ticks, in which half as
-    many rows are executed; so the ramp ends exactly at a row.
+    many rows are executed; so the ramp ends exactly at a row. The motion begins at rest, at the first row: if the ramp
+    began before it, a robot that is already there would meet the second row at an arbitrary speed.
 
     Args:
-        start: The pose at rest, (D,); not used for relative actions.
-        approach: The number of ticks to the first row; 0 if it is near.
+        start: The pose at rest, (D,), in the action's units; its deltas are not used.
+        approach: The number of ticks to the first row; at least 1 if it is a pose, 0 if it has only deltas.
         ramp: The number of ticks until the full speed; an even number.
-        relative: Whether actions are deltas, which are then scaled.
+        deltas: The columns that are deltas, which are scaled instead of approached.
+        at_once: The columns of grippers without limits, which take the values of the rows unchanged.
     """
 
-    def __init__(self, start: np.ndarray, approach: int, ramp: int, *, relative: bool = False) -> None:
+    def __init__(
+        self, start: np.ndarray, approach: int, ramp: int, *, deltas: Sequence[int] = (), at_once: Sequence[int] = ()
+    ) -> None:
         self._from = start
-        self._approach, self._ramp, self._relative = approach, ramp, relative
+        self._approach, self._ramp = approach, ramp
+        self._deltas, self._at_once = list(deltas), list(at_once)
+        self._is_motion = bool(self._deltas)  # a row of deltas is a motion, so that the ramp begins before it
         self._tick = -approach  # of the ramp
         self._place = 0.0  # on the plan, in rows since the ramp's begin
 
@@ -50,20 +58,31 @@ class EaseIn:
             share = 1.0 + self._tick / self._approach
             share *= share * share * (10.0 - 15.0 * share + 6.0 * share * share)
             command = self._between(action, share)
-            if self._tick == 0:
-                self._from = action
-            return command, int(self._tick == 0)
+            command[self._deltas] = 0.0
+            if self._tick < 0:
+                return command, 0
+            self._from = action
+            return command, 0 if self._is_motion else 1
         before, self._place = self._place, self._tick**2 / (2 * self._ramp)
         row = int(self._place)
+        share = self._place - row
         if row == int(before):
-            share = self._place - before if self._relative else self._place - row
-            return self._between(action, share), 0
-        if self._relative:
-            rest = 0.0 if after is None else (self._place - row) * after
-            return np.asarray((row - before) * action + rest, np.float32), 1
+            command = self._between(action, share)
+            command[self._deltas] = (self._place - before) * action[self._deltas]
+            return command, 0
         self._from = action
-        return self._between(action if after is None else after, self._place - row), 1
+        if after is None or share == 0.0:
+            command = action.copy()
+            command[self._deltas] = (row - before) * action[self._deltas]
+            return command, 1
+        command = self._between(after, share)
+        command[self._deltas] = (row - before) * action[self._deltas] + share * after[self._deltas]
+        return command, 1
 
     def _between(self, action: np.ndarray, share: float) -> np.ndarray:
-        start = 0.0 if self._relative else self._from
-        return action if share == 1.0 else np.asarray(start + share * (action - start), np.float32)
+        """Return the pose at a share of the way to an action, (D,) float32."""
+        if share == 1.0:
+            return action.copy()
+        command = np.asarray(self._from + share * (action - self._from), np.float32)
+        command[self._at_once] = action[self._at_once]
+        return command

@@ -8,6 +8,7 @@ from typing import Literal, NamedTuple, get_args
 
 import numpy as np
 
+from vlagents_ray.chunking.buffer import ChunkBuffer
 from vlagents_ray.chunking.ease import EaseIn
 from vlagents_ray.contract import ActionSpec, Contract
 from vlagents_ray.errors import (
@@ -15,6 +16,7 @@ from vlagents_ray.errors import (
     ConnectionLost,
     DeadlineExceeded,
     InvalidAction,
+    PolicyFailed,
     PolicyUnavailable,
     VLAgentsError,
 )
@@ -79,19 +81,19 @@ class SafeAction:
 
     "hold" repeats the last command, which is right for absolute targets. "zero" commands no motion, which is
     right for deltas and velocities; the columns in `grippers` keep the last action's value, since 0 would half open a
-    gripper whose command is a position; before the first action, the last column is the measured opening. "auto"
+    gripper whose command is a position; before the first action, a single gripper has the measured opening. "auto"
     chooses by the contract's `ActionSpec`. An array (D,), or a function of the observation that returns one (for
     instance of the measured joints), is used unchanged.
 
     Args:
         safe: The name, array or function of the safe action.
         spec: The actions of the contract.
-        grippers: The columns of the grippers; by default the last one, if the contract states the gripper's opening.
+        grippers: The columns of the grippers; default: `ActionSpec.gripper_columns`.
 
     Raises:
         ConfigError: The choice would be a guess or would move the robot: a repeated delta continues the motion, and
             zeros as joint targets move the arm to its zero position. Only "hold" is allowed if the contract does
-            not describe the actions.
+            not describe the actions. Or the arms of the contract do not share its numbers equally.
     """
 
     def __init__(self, safe: Safe, spec: ActionSpec, grippers: Sequence[int] | None = None) -> None:
@@ -112,8 +114,10 @@ class SafeAction:
                 raise ConfigError(f"safe: got {safe!r}, which {moves}; give safe={self._make!r}, or 'auto'")
         else:
             self._make = safe if callable(safe) else np.asarray(safe, np.float32)
-        self._grippers = list(grippers) if grippers is not None else [-1] if spec.gripper_open is not None else []
+        self._grippers = None if grippers is None else list(grippers)
         self._spec = spec
+        if spec.dim is not None:
+            self._gripper_columns(spec.dim)
         self.holds = spec.relative is False or (isinstance(safe, str) and safe == "hold")
         """Whether repeating the last action keeps the robot in place."""
 
@@ -132,8 +136,12 @@ class SafeAction:
         if self._make == "hold":
             return last.copy()
         action = np.zeros_like(last)
-        action[self._grippers] = last[self._grippers]
+        grippers = self._gripper_columns(len(last))
+        action[grippers] = last[grippers]
         return action
+
+    def _gripper_columns(self, dim: int) -> list[int]:
+        return self._spec.gripper_columns(dim) if self._grippers is None else self._grippers
 
     def _first(self, obs: Obs) -> np.ndarray | None:
         """Return an action without motion that holds the gripper, (D,); None if the contract is not sufficient."""
@@ -141,11 +149,13 @@ class SafeAction:
         if spec.dim is None:
             return None
         action = np.zeros(spec.dim, np.float32)
-        if self._grippers:
-            ends = spec.gripper_closed, spec.gripper_open
-            if self._grippers != [-1] or obs.gripper is None or ends[0] is None or ends[1] is None:
+        grippers = self._gripper_columns(spec.dim)
+        if grippers:
+            closed, opened = spec.gripper_closed, spec.gripper_open
+            # An observation has one opening, which says too little of several grippers.
+            if len(grippers) > 1 or obs.gripper is None or closed is None or opened is None:
                 return None
-            action[-1] = ends[0] + obs.gripper * (ends[1] - ends[0])
+            action[grippers] = closed + obs.gripper * (opened - closed)
         return action
 
 
@@ -155,13 +165,13 @@ def stopping(spec: ActionSpec) -> SafeName:
 
 
 def neutral(spec: ActionSpec, dim: int | None = None) -> np.ndarray:
-    """Return an action without motion for relative actions, (D,) float32, with an open gripper if `spec` states how."""
+    """Return an action without motion for relative actions, (D,) float32, with open grippers if `spec` states how."""
     dim = spec.dim if dim is None else dim
     if dim is None:
         raise InvalidAction("neutral action: got a contract without action.dim; want one that states it")
     action = np.zeros(dim, np.float32)
     if spec.gripper_open is not None:
-        action[-1] = spec.gripper_open
+        action[spec.gripper_columns(dim)] = spec.gripper_open
     return action
 
 
@@ -184,10 +194,14 @@ class Motion:
         self._before: np.ndarray | None = None  # the last one of earlier ticks
         self._state: Literal["stopped", "moving", "held"] = "stopped"
 
-    @property
-    def speeds_up(self) -> bool:
-        """Whether the robot, coming from rest, is still slower than the plan."""
-        return self._ease is not None and self._ease.arrived and not self._ease.over
+    def keeps(self, plan: ChunkBuffer) -> bool:
+        """Return whether the plan must stay: a robot that comes from rest is on its way to the next row.
+
+        Another answer would begin elsewhere, which the command would jump to.
+        """
+        if self._ease is None or self._ease.over:
+            return False
+        return not self._ease.arrived or plan.after is not None
 
     def tick(self) -> None:
         """Begin a tick, at which one action may be commanded."""
@@ -209,27 +223,31 @@ class Motion:
         self._last, self._state = self._checked(action, last), "moving"
         return self._last
 
-    def follow(self, action: np.ndarray, after: np.ndarray | None, obs: Obs) -> tuple[np.ndarray, int]:
+    def follow(self, plan: ChunkBuffer, obs: Obs) -> tuple[np.ndarray, int]:
         """Return the command on the way of a plan, (D,) float32, and the number of rows that it completes.
 
         From rest, the check's `ease_in` leads the robot onto the plan; its rows wait meanwhile.
 
         Args:
-            action: The next row, (D,).
-            after: The row behind it, (D,), if there is one.
+            plan: The plan, which has a next row.
             obs: The current observation.
 
         Raises:
             InvalidAction: The command must not be sent.
+            PolicyFailed: The plan has no next row.
         """
+        if plan.next is None:
+            raise PolicyFailed(f"plan: expected a row for step {plan.executed}, got none")
+        action = plan.next.action
         ease_in = getattr(self._check, "ease_in", None)
         if self._state != "moving" and ease_in is not None:
             start = self._last if self._state == "held" else self._standing(obs)
-            if start is not None and (ease := ease_in(start, action)) is not None:
+            ease = ease_in(start, action, plan=plan.leftover())
+            if ease is not None:
                 self._ease, self._last, self._state = ease, start, "moving"
         if self._ease is None or self._ease.over:
             return self.move(action, obs), 1
-        command, rows = self._ease.step(action, after)
+        command, rows = self._ease.step(action, plan.after)
         self._last = self._checked(command, self._last)
         return self._last, rows
 

@@ -147,7 +147,7 @@ class PlayerSettings:
     """
     deadline_s: float | None = None  # time limit of `act`; 0 by default in "async", else none
     timeout_s: float | None = None  # time limit of a request; by default the agent's
-    horizon: int | None = None  # largest number of rows of a chunk to execute
+    horizon: int | None = None  # largest number of rows of a chunk to execute; a chunk with `done` is executed whole
     max_age_s: float | None = None
     """The largest age of the observation of an executed action. The age counts from `info["captured_at"]`, that of the
     sensor read first, or else from the call of `act` (see `CaptureClock`).
@@ -363,8 +363,7 @@ class ChunkPlayer(Agent):
 
     def _note_asked(self, tick: int, obs: Obs) -> None:
         self._request = _Request(tick, self._plan.executed, self._captured(obs))
-        # A robot that speeds up is between two rows, so that the answer would begin up to a row away from it.
-        self._dropped = self._motion.speeds_up and self._plan.after is not None
+        self._dropped = self._motion.keeps(self._plan)
 
     def _is_old(self, seen_at: float) -> bool:
         return self.settings.max_age_s is not None and seen_at < time.monotonic() - self.settings.max_age_s
@@ -392,7 +391,7 @@ class ChunkPlayer(Agent):
             return
         if isinstance(answer, Act):
             try:
-                if not (self._dropped or (self._motion.speeds_up and self._plan.after is not None)):
+                if not (self._dropped or self._motion.keeps(self._plan)):
                     self._delay.add(tick - self._request.tick)
                     self._take(answer)
                 self._waiting_since = None
@@ -406,10 +405,9 @@ class ChunkPlayer(Agent):
     def _take(self, act: Act) -> None:
         act = replace(act, info={key: value for key, value in act.info.items() if key not in OF_THE_LOOP})
         tick, step, seen_at = self._request
-        rows = Act(check_action(act.action, self._contract)).rows()[: self.settings.horizon]
-        if self.settings.mode == "open_loop" and act.done and self.settings.execute is not None:
-            # A late answer keeps one row, since the last row states that the task is done.
-            rows = rows[: max(self.settings.execute, self._plan.executed + 1 - step)]
+        rows = Act(check_action(act.action, self._contract)).rows()
+        if not act.done:  # the task is done with the last row of this chunk, not before
+            rows = rows[: self.settings.horizon]
         added = self._plan.add(Chunk(self._chunks, step, rows, act.done, act.info, tick, seen_at))
         self._chunks += 1
         self._trouble = WAITING if added else LATE
@@ -454,7 +452,7 @@ class ChunkPlayer(Agent):
         why = held or (STALE if self._is_old(self._captured(obs)) else self._trouble)
         if step is not None:
             try:
-                action, rows = self._motion.follow(step.action, self._plan.after, obs)
+                action, rows = self._motion.follow(self._plan, obs)
             except InvalidAction as error:
                 self._plan.drop()  # the rest of the plan assumes the result of this action
                 why = refused(error)

@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 import contextlib
+import functools
 import importlib
+import logging
 import pkgutil
+import threading
 import time
 from typing import Any
 
@@ -16,12 +19,39 @@ from vlagents_ray.interface import CAPTURED, Obs
 from vlagents_ray.naming import did_you_mean
 from vlagents_ray.registry import require
 
+logger = logging.getLogger(__name__)
+
+
+class OneAtATime:
+    """A bus of motors whose methods run one at a time.
+
+    LeRobot's buses have no lock, and the watchdog's thread stops a robot while the loop may be in a transfer. Each
+    call is locked by itself, so that a stop waits for a transfer and not for the cameras that are read after it.
+    """
+
+    def __init__(self, bus: Any) -> None:
+        self._bus = bus
+        self._lock = threading.RLock()
+
+    def __getattr__(self, name: str) -> Any:
+        value = getattr(self._bus, name)
+        if not callable(value):
+            return value
+
+        @functools.wraps(value)
+        def locked(*args: Any, **options: Any) -> Any:
+            with self._lock:
+                return value(*args, **options)
+
+        return locked
+
 
 class LeRobotRobot:
     """Any robot that LeRobot drives, by the name that its configuration registers.
 
     Joints stay in LeRobot's order and units, which are those of its datasets and of policies that were trained on
-    them. The part `joints`, (D,), of an observation and an action have the same numbers, the gripper among them.
+    them. The part `joints`, (D,), of an observation and an action have the same numbers, the gripper among them. The
+    motors whose name contains "gripper" keep their goal at a stop, and with it what they hold.
 
     Args:
         kind: The registered name, such as "so101_follower".
@@ -32,6 +62,9 @@ class LeRobotRobot:
         ConfigError: LeRobot has no such robot, a setting is wrong, or the robot is not calibrated.
         MissingDependency: LeRobot, or the driver of the robot's motors, is not installed.
     """
+
+    _measured: np.ndarray | None = None  # the joints as measured last, (D,)
+    _goal: np.ndarray | None = None  # the last action, (D,)
 
     def __init__(self, kind: str, *, unit: str = "", **settings: Any) -> None:
         package = require("lerobot.robots")
@@ -55,6 +88,13 @@ class LeRobotRobot:
             raise ConfigError(f"lerobot:{kind}: not calibrated; run lerobot-calibrate --robot.type={kind} with its id")
         self._unit = unit or ("deg" if getattr(config, "use_degrees", False) else "%")
         self._keys = list(self._robot.action_features)
+        self._lock_buses()
+
+    def _lock_buses(self) -> None:
+        """Let the methods of the robot's buses run one at a time."""
+        for part in (self._robot, *vars(self._robot).values()):  # a robot with two arms has a bus in each of them
+            if hasattr(part, "bus"):
+                part.bus = OneAtATime(part.bus)
 
     @property
     def joint_names(self) -> list[str]:
@@ -96,6 +136,7 @@ class LeRobotRobot:
         at = time.time()
         seen = self._robot.get_observation()
         joints = np.array([seen[key] for key in self._keys], np.float32)
+        self._measured = joints.copy()
         images = {name: np.asarray(seen[name]) for name in self.contract.cameras or {}}
         return Obs(images, None, {"joints": joints}, {CAPTURED: at})
 
@@ -103,11 +144,52 @@ class LeRobotRobot:
         """Send the goal positions."""
         if np.shape(action) != (len(self._keys),):
             raise InvalidAction(f"action: got {np.shape(action)}, want ({len(self._keys)},): {self._keys}")
+        self._goal = np.array(action, np.float32)
         self._robot.send_action(dict(zip(self._keys, map(float, action), strict=True)))
 
     def stop(self) -> None:
-        """Make the measured positions the goal; torque stays on, so that the arm does not fall."""
-        self.apply(self.observe().state["joints"])
+        """Make the measured positions the goal; torque stays on, so that the arm does not fall.
+
+        No camera is read. Without a bus, or if it cannot be read, the goal is the pose of the last observation. The
+        grippers keep their goal.
+
+        Raises:
+            Exception: The motors cannot be reached, or the robot was commanded and no pose is known.
+        """
+        try:
+            held = self._present().copy()
+        except Exception as error:
+            if self._goal is not None:
+                raise
+            logger.warning("stop: no pose of the robot is known (%s); it was not commanded, and stays as it is", error)
+            return
+        if self._goal is not None:
+            grippers = ["gripper" in name for name in self.joint_names]
+            held[grippers] = self._goal[grippers]
+        goals = dict(zip(self._keys, map(float, held), strict=True))
+        try:
+            self._robot.send_action(goals)
+        except Exception:
+            bus = getattr(self._robot, "bus", None)
+            if bus is None:
+                raise
+            # With max_relative_target, LeRobot reads the positions before it sends a goal.
+            bus.sync_write("Goal_Position", {key.removesuffix(".pos"): goal for key, goal in goals.items()})
+
+    def _present(self) -> np.ndarray:
+        """Return the joints without reading a camera if possible, (D,)."""
+        bus: Any = getattr(self._robot, "bus", None)
+        if hasattr(bus, "sync_read"):
+            try:
+                positions = bus.sync_read("Present_Position")
+                return np.array([positions[name] for name in self.joint_names], np.float32)
+            except Exception as error:
+                if self._measured is None:
+                    raise
+                logger.warning("stop: the motors' positions cannot be read (%s); the last ones are the goal", error)
+        if self._measured is None:
+            return self.observe().state["joints"]
+        return self._measured
 
     def close(self) -> None:
         """Disconnect; whether torque is released is a setting of LeRobot's configuration."""

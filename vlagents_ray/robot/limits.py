@@ -12,6 +12,8 @@ from typing import Any
 
 import numpy as np
 
+from vlagents_ray.contract import ActionSpec
+from vlagents_ray.dataset_contract import INFO, DatasetContract
 from vlagents_ray.errors import ConfigError
 from vlagents_ray.naming import did_you_mean, without_doubles
 from vlagents_ray.registry import require
@@ -21,33 +23,57 @@ Numbers = float | tuple[float, ...]  # one for all numbers of an action, or one 
 QUANTILE = 0.999  # of the demonstrations' speeds: a single broken frame must not set a limit
 MARGIN = 2.0
 """Limits from a dataset are its quantiles times this. The soft start begins at half of them, i.e. at the quantiles."""
+_PER_RAD = {"rad": 1.0, "deg": 180 / math.pi}
 _ROOM = 0.1  # share of the demonstrated range by which an action may leave it
 
 
 @dataclass(frozen=True, slots=True)
 class Limits:
-    """The limits of the actions, (D,) in their units and order; None checks nothing."""
+    """The limits of the actions, (D,) in their units and order; None checks nothing.
+
+    Raises:
+        ConfigError: A number is NaN or otherwise wrong, or has no effect without another field that is not set.
+    """
 
     low: Numbers | None = None
     high: Numbers | None = None
     velocity: Numbers | None = None  # units/s
     acceleration: Numbers | None = None  # units/s^2, of speeding up; a robot may always brake
-    jerk: Numbers | None = None  # units/s^3, likewise
+    jerk: Numbers | None = None  # units/s^3, as `acceleration`
     first: Numbers | None = None
     """The largest distance of the first action from the pose at rest; default: that of 0.5 s at `velocity`."""
-    rest: tuple[float, ...] | None = None  # pose to which the arm goes slowly at the end of a run
+    rest: tuple[float | None, ...] | None = None
+    """The pose to which the arm goes slowly at the end of a run; a number that is None, as that of a gripper must be,
+    stays as it was commanded."""
     joints: tuple[str, ...] = ()  # the names of the action's numbers, in order
     unit: str = "rad"  # "rad" or "deg", of the joints
     workspace_low: tuple[float, float, float] | None = None  # m, of the tip in the base frame of the URDF
     workspace_high: tuple[float, float, float] | None = None
     chain: Chain | None = None  # from joints to the tip
 
+    def __post_init__(self) -> None:
+        for name in ("low", "high", "velocity", "acceleration", "jerk", "first", "workspace_low", "workspace_high"):
+            numbers = _numbers(name, getattr(self, name))
+            if name in ("velocity", "acceleration", "jerk", "first") and (numbers < 0).any():
+                raise ConfigError(f"{name}: expected numbers of 0 or more, got {getattr(self, name)}")
+            if name.startswith("workspace") and getattr(self, name) is not None and numbers.shape != (3,):
+                raise ConfigError(f"{name}: expected x, y and z in m, got {getattr(self, name)}")
+        poses = () if self.rest is None else [number for number in self.rest if number is not None]
+        if not np.isfinite(_numbers("rest", poses)).all():
+            raise ConfigError(f"rest: expected finite numbers or null, got {self.rest}")
+        if self.unit not in _PER_RAD:
+            raise ConfigError(f"unit: got {self.unit!r}, want 'rad' or 'deg'")
+
     @classmethod
-    def read(cls, path: str | Path) -> Limits:
+    def read(cls, path: str | Path, action: ActionSpec | None = None) -> Limits:
         """Read limits from a `.yaml` or `.json` file, a `.urdf` file, or the folder of a LeRobotDataset v3.0.
 
         The keys of a YAML or JSON file are the fields of this class, without `chain`, and further `urdf`, a file beside
         it whose limits also apply, and `tip`, the link that the workspace is for.
+
+        Args:
+            path: The file or folder.
+            action: The meaning of the actions of a dataset that does not contain it; default: absolute targets.
 
         Raises:
             ConfigError: The file is missing, or has an unknown key or a wrong value.
@@ -56,29 +82,40 @@ class Limits:
         path = Path(path)
         try:
             if path.is_dir():
-                return cls._of_dataset(path)
+                return cls._of_dataset(path, action)
             if path.suffix == ".urdf":
                 return cls._of_urdf(path, (), None, 1.0)
-            given = _document(path)
-            urdf, tip = given.pop("urdf", None), given.pop("tip", None)
-            known = {one.name for one in fields(cls)} - {"chain"} | {"urdf", "tip"}
-            if unknown := sorted(set(given) - known):
-                meant = "".join(did_you_mean(str(key), known) for key in unknown)
-                raise ConfigError(f"{path}: unknown keys {unknown}, want some of {sorted(known)}{meant}")
-            values = {key: _tuple(value, -math.inf if key == "low" else math.inf) for key, value in given.items()}
-            limits = cls(**values)
-            if (scale := {"rad": 1.0, "deg": 180 / math.pi}.get(limits.unit)) is None:
-                raise ConfigError(f"{path}: unit: got {limits.unit!r}, want 'rad' or 'deg'")
-            for key in ("low", "high", "velocity", "acceleration", "jerk", "first", "rest"):
-                np.asarray(getattr(limits, key) or 0.0, np.float64)
-            if urdf is None:
-                return limits
-            return limits.stricter(cls._of_urdf(path.parent / urdf, limits.joints, tip, scale))
+            return cls._of_document(path, _document(path))
         except (OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError, ET.ParseError) as error:
             raise ConfigError(
                 f"limits {path}: {type(error).__name__}: {error}; want a .yaml or .json file of limits, a .urdf, or a "
                 f"LeRobotDataset v3.0; see docs/control_loop.md"
             ) from error
+
+    @classmethod
+    def _of_document(cls, path: Path, document: Any) -> Limits:
+        urdf, tip = document.pop("urdf", None), document.pop("tip", None)
+        known = {field.name for field in fields(cls)} - {"chain"} | {"urdf", "tip"}
+        if unknown := sorted(set(document) - known):
+            meant = "".join(did_you_mean(str(key), known) for key in unknown)
+            raise ConfigError(f"unknown keys {unknown}, want some of {sorted(known)}{meant}")
+        if not isinstance(document.get("joints", []), list):
+            raise ConfigError(f"joints: expected a list of names, got {document['joints']!r}")
+        limits = cls(**{key: _value(key, value) for key, value in document.items()})
+        bounds_workspace = limits.workspace_low is not None or limits.workspace_high is not None
+        if bounds_workspace != (tip is not None) or (tip is not None and urdf is None):
+            raise ConfigError(
+                "tip, urdf and workspace: expected `tip` and `urdf` with `workspace_low` or `workspace_high`, as each "
+                "has no effect without the others; add what is missing, or remove the rest"
+            )
+        if urdf is None:
+            if "unit" in document:
+                raise ConfigError(
+                    "unit: expected `urdf` with it, whose numbers it converts; got none, and limits are in the units "
+                    "of the actions; remove `unit`"
+                )
+            return limits
+        return limits.stricter(cls._of_urdf(path.parent / urdf, limits.joints, tip, _PER_RAD[limits.unit]))
 
     def bounds(self, dim: int) -> tuple[np.ndarray, np.ndarray]:
         """Return `low` and `high`, (dim,) each; infinite where none is set, and for another number of joints."""
@@ -101,30 +138,45 @@ class Limits:
         return replace(self, chain=self.chain or other.chain, joints=self.joints or other.joints, **bounds)  # type: ignore[arg-type]
 
     @classmethod
-    def _of_dataset(cls, folder: Path) -> Limits:
+    def _of_dataset(cls, folder: Path, action: ActionSpec | None) -> Limits:
         info = json.loads((folder / "meta/info.json").read_text())
+        if INFO in info:
+            action = DatasetContract.from_json(info[INFO]).contract.action
         parquet, fps = require("pyarrow.parquet", extra="record"), float(info["fps"])
         episodes: dict[int, list[np.ndarray]] = {}
         for file in sorted(folder.glob("data/*/*.parquet")):
             table = parquet.read_table(file, columns=["action", "episode_index"])
             rows = np.array(table["action"].to_pylist(), np.float64)
+            rows = rows.reshape(len(rows), -1)  # LeRobot stores an action of one number as a scalar
             numbers = table["episode_index"].to_numpy()
-            for one in np.unique(numbers):
-                episodes.setdefault(int(one), []).append(rows[numbers == one])
+            for number in np.unique(numbers):
+                episodes.setdefault(int(number), []).append(rows[numbers == number])
+        if not episodes:
+            raise ConfigError("expected at least one frame in data/, got none")
         whole = [np.concatenate(parts) for parts in episodes.values()]
         actions = np.concatenate(whole)
         room = _ROOM * np.ptp(actions, axis=0)
-        names = info["features"]["action"].get("names")
+        deltas = (action or ActionSpec()).delta_columns(actions.shape[1])
+        paths = [_path(episode, deltas) for episode in whole]
 
         def fastest(order: int) -> tuple[float, ...]:
-            changes = np.concatenate([np.abs(np.diff(one, order, axis=0)) for one in whole if len(one) > order])
-            limit = np.quantile(changes, QUANTILE, axis=0) * MARGIN * fps**order
+            changes = [np.abs(np.diff(path, order, axis=0)) for path in paths if len(path) > order]
+            if not changes:
+                return tuple([math.inf] * actions.shape[1])
+            limit: np.ndarray = np.quantile(np.concatenate(changes), QUANTILE, axis=0)
+            if deltas:  # a motion of deltas begins at rest, in too few frames to count among all
+                starts = np.stack([episode[:order].max(0) for episode in changes])
+                limit = np.maximum(limit, np.quantile(starts, QUANTILE, axis=0, method="higher"))
+            limit *= MARGIN * fps**order
             # A gripper that hardly ever moves has the quantile 0, by which it could never be moved.
-            return tuple(np.where(limit > 0, limit, np.inf).tolist())
+            return tuple(number if number > 0 else math.inf for number in limit.tolist())
 
+        low, high = actions.min(0) - room, actions.max(0) + room
+        low[deltas], high[deltas] = -np.inf, np.inf  # the range of deltas is that of the speeds
+        names = info["features"]["action"].get("names")
         return cls(
-            low=tuple((actions.min(0) - room).tolist()),
-            high=tuple((actions.max(0) + room).tolist()),
+            low=tuple(low.tolist()),
+            high=tuple(high.tolist()),
             velocity=fastest(1),
             acceleration=fastest(2),
             jerk=fastest(3),
@@ -214,8 +266,35 @@ def _three(text: str) -> list[float]:
     return [x, y, z]
 
 
-def _tuple(value: Any, unlimited: float) -> Any:
-    return tuple(unlimited if one is None else one for one in value) if isinstance(value, list) else value
+def _path(actions: np.ndarray, deltas: list[int]) -> np.ndarray:
+    """Return the path of an episode's actions, (T, D); with deltas (T + 3, D), their sum, which begins at rest.
+
+    The differences of a path are speeds for both kinds of actions.
+    """
+    if not deltas:
+        return actions
+    path = actions.copy()
+    path[:, deltas] = np.cumsum(path[:, deltas], axis=0)
+    before = path[:1].copy()
+    before[:, deltas] = 0.0
+    return np.concatenate([before, before, before, path])
+
+
+def _numbers(name: str, value: object) -> np.ndarray:
+    """Return the number, or the numbers of a list, of a limit; none for None. Raises `ConfigError` for others."""
+    values = [] if value is None else value if isinstance(value, (tuple, list, np.ndarray)) else [value]
+    for number in values:
+        if isinstance(number, bool) or not isinstance(number, (int, float, np.number)) or math.isnan(number):
+            raise ConfigError(f"{name}: expected numbers, got {number!r} in {value}")
+    return np.array(values, np.float64)
+
+
+def _value(key: str, value: Any) -> Any:
+    """Return the value of a key of a file, where null in a list is no limit, or a number of `rest` that stays."""
+    if not isinstance(value, list):
+        return value
+    unlimited = -math.inf if key in ("low", "workspace_low") else math.inf
+    return tuple(unlimited if number is None and key != "rest" else number for number in value)
 
 
 def _document(path: Path) -> Any:

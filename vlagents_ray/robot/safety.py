@@ -19,6 +19,7 @@ from vlagents_ray.interface import Obs
 from vlagents_ray.robot.limits import Limits
 
 SOFT_START_S = 120.0
+_ROUNDING = 2.0**-23  # of a float32, with a margin for actions of earlier ticks that were larger
 _FIRST_S = 0.5  # of the limit of velocity: how far the first action may be
 _SLOWLY = 2.0  # how many times longer than its limits require the way from rest to the first action takes
 
@@ -26,11 +27,12 @@ _SLOWLY = 2.0  # how many times longer than its limits require the way from rest
 class Guard:
     """A check that accepts an action or raises `InvalidAction`; it never clips one, as that would be another motion.
 
-    The guard checks the action's shape, that its numbers are finite and within the bounds, and that an absolute target
-    is not too far from the previous one. There is no previous action before the first one, and after a stop the arm
-    need not be where the last action commanded it. With `measure` these actions are compared with the measured pose.
-    Without it the first action may be anywhere within the bounds, and one after a stop is compared with the last
-    action.
+    The guard checks the action's shape, that its numbers are finite and within the bounds, and that it is not too far
+    from the previous one. There is no previous action before the first one, and after a stop the arm need not be where
+    the last action commanded it. With `measure` these actions are compared with the measured pose, and the grippers
+    with their last command. Without it the first absolute action may be anywhere within the bounds, and one after a
+    stop is compared with the last action. Relative actions are compared with no motion; their grippers, which are
+    positions, with the last command.
 
     With `limits`, speed, acceleration and jerk are also checked, and the position of the tip. Braking is always
     allowed, as the robot's own stop is harder. A chunk player then eases each motion in from rest
@@ -39,7 +41,7 @@ class Guard:
     Args:
         contract: The policy's contract, for the action's dimension and bounds; None checks neither.
         low: Lower bound, for all numbers of an action or (D,), in the action's units; the strictest of this, the
-            contract's and that of `limits` applies.
+            contract's and that of `limits` applies. Bounds of relative actions are of the actions themselves.
         high: Upper bound, as `low`.
         max_step: Largest difference between two consecutive actions, for all numbers or (D,); None checks none.
         measure: Returns the measured pose in an observation, (D,) in the action's order and units, e.g.
@@ -50,8 +52,8 @@ class Guard:
             their values, since most accidents happen in the first minutes of a new checkpoint; 0 for none.
 
     Raises:
-        ConfigError: A bound is NaN, `max_step` is negative, `measure` is given for relative actions, or `limits`
-            without `hz`.
+        ConfigError: A bound is NaN, `max_step` is negative, `measure` is given for relative actions, `limits` without
+            `hz`, or a limit that has no effect on the actions of the contract.
     """
 
     def __init__(
@@ -67,14 +69,13 @@ class Guard:
         soft_start_s: float = SOFT_START_S,
     ) -> None:
         spec = contract.action if contract is not None else ActionSpec()
-        self.limits = limits = Limits.read(limits) if isinstance(limits, (str, Path)) else limits
+        self.limits = limits = Limits.read(limits, spec) if isinstance(limits, (str, Path)) else limits
         self.hz = hz
+        self._spec = spec
         self._dim = spec.dim
-        self._relative = bool(spec.relative)
         own = limits or Limits()
-        bounds = (None, None) if self._relative else (own.low, own.high)  # of poses
-        self._low = _bounds("low", np.maximum, spec.low, low, bounds[0])
-        self._high = _bounds("high", np.minimum, spec.high, high, bounds[1])
+        self._low = _bounds("low", np.maximum, spec.low, low, own.low)
+        self._high = _bounds("high", np.minimum, spec.high, high, own.high)
         self._max_step = None if max_step is None else np.asarray(max_step, np.float64)
         if self._max_step is not None and not (self._max_step >= 0).all():  # with NaN any step would pass
             raise ConfigError(f"max_step: got {max_step}, want 0 or above, or None")
@@ -90,6 +91,8 @@ class Guard:
         self._soft_ticks = soft_start_s * (hz or 0.0)
         self._moved = 0  # ticks of motion
         self._columns: list[list[float]] = []  # low, high, max_step, velocity, acceleration, jerk; units and ticks
+        self._grippers: list[int] = []
+        self._deltas: list[int] = []
         self._then: list[float] | None = None  # the last accepted action; None at rest
         self._speed: list[float] = []  # its change from the one before, units a tick
         self._change: list[float] = []  # the change of that
@@ -111,14 +114,22 @@ class Guard:
             InvalidAction: `measure` returns NaN or infinity, so that no action can be checked.
         """
         self._then = None
+        if last is not None and self._spec.relative:
+            self._limits_of(len(last))
+            standing = last.copy()
+            standing[self._deltas] = 0.0  # the robot stands
+            return standing
         if self._measure is None:
             return last
-        pose = np.asarray(self._measure(obs), np.float32)
+        pose = np.array(self._measure(obs), np.float32)
         wanted = self._dim if last is None else len(last)
         if pose.ndim != 1 or wanted not in (None, len(pose)):
             raise ConfigError(f"measure: got {pose.shape}, want ({wanted or 'D'},), as an action is")
         if not np.isfinite(pose).all():
             raise InvalidAction(f"measure: got {pose.tolist()}, want finite numbers; the robot's sensors are broken")
+        if last is not None:
+            self._limits_of(len(last))
+            pose[self._grippers] = last[self._grippers]  # a stop keeps the grasp, which the measured opening loosens
         return pose
 
     def __call__(self, action: np.ndarray, last: np.ndarray | None = None) -> np.ndarray:
@@ -148,16 +159,17 @@ class Guard:
                 raise InvalidAction(
                     f"action[{i}]: got {number:g}, {name} the limit {limit:g}; see the contract", cause="limits"
                 )
-        if self.limits is not None and self.limits.chain is not None and not self._relative:
+        if self.limits is not None and self.limits.chain is not None:
             self._check_workspace(self.limits, self.limits.chain.tip(now))
-        if last is None:
-            self._then, self._speed, self._change = now, [0.0] * len(now), [0.0] * len(now)
-            return action
-        if last.shape != action.shape:
+        if last is not None and last.shape != action.shape:
             raise InvalidAction(f"action: got {action.shape} after {np.shape(last)}, want as many numbers as before")
-        then = last.tolist()
+        then = now.copy() if last is None else last.tolist()
+        if last is None:  # from an unknown pose, but at rest
+            self._then = None
+            for i in self._deltas:
+                then[i] = 0.0
         for i, number in enumerate(now):
-            if abs(number - then[i]) > steps[i]:
+            if abs(number - then[i]) > steps[i] + 2 * _ROUNDING * max(abs(number), abs(then[i])):
                 raise InvalidAction(
                     f"action[{i}]: got {number:g} after {then[i]:g}, a larger step than max_step allows",
                     cause="max_step",
@@ -166,49 +178,83 @@ class Guard:
             self._check_dynamics(now, then, dynamic)
         return action
 
-    def ease_in(self, start: np.ndarray, goal: np.ndarray, *, far: bool = False) -> EaseIn | None:
+    def ease_in(
+        self, start: np.ndarray | None, goal: np.ndarray, *, plan: np.ndarray | None = None, far: bool = False
+    ) -> EaseIn | None:
         """Plan the ease-in from a pose at rest to an action.
 
         Args:
-            start: The pose at rest, (D,) in the action's units.
+            start: The pose at rest, (D,) in the action's units; None if it is unknown. Of relative actions only the
+                grippers are used.
             goal: The first action, (D,).
+            plan: The rows of the plan from `goal` on, (H, D), whose speeds apply where the limits have none.
             far: Whether the distance is not checked.
 
         Returns:
-            The ease-in; None without limits of speed.
+            The ease-in; None without limits of speed, acceleration and jerk, or from an unknown pose.
 
         Raises:
             InvalidAction: The action is farther from the pose than `Limits.first`.
         """
-        if self.limits is None or self.limits.velocity is None or start.shape != goal.shape:
+        if self.limits is None or (start is None and not self._spec.relative):
             return None
-        tightened, (*_, velocity, acceleration, jerk) = self._softness(), self._limits_of(len(goal))
+        *_, velocity, acceleration, jerk = self._limits_of(len(goal))
+        start = goal if start is None else start  # of relative actions, whose grippers are unknown
+        if start.shape != goal.shape:
+            return None
+        if not (far or self._spec.relative):
+            self._check_first(self.limits, start, goal, velocity)
+        of_time = (self.limits.velocity, self.limits.acceleration, self.limits.jerk)
+        if all(limit is None for limit in of_time):
+            return None
+        at_once = [i for i in self._grippers if velocity[i] == acceleration[i] == jerk[i] == math.inf]
+        ways = np.abs(goal.astype(np.float64) - start)
+        ways[self._deltas + at_once] = 0.0
+        speeds = self._speeds(goal if plan is None else plan)
         ramp = approach = 0.0
-        near = True
-        first = np.broadcast_to(np.inf if self.limits.first is None else self.limits.first, start.shape)
-        for i, way in enumerate(np.abs(goal.astype(np.float64) - start).tolist()):
-            v, a, j = (tightened * one[i] for one in (velocity, acceleration, jerk))
-            allowed = min(float(first[i]), velocity[i] * (self.hz or 0.0) * _FIRST_S)
-            if not (far or self._relative) and way > allowed:
-                raise InvalidAction(
-                    f"action[{i}]: got {goal[i]:g} as the first action, {way:g} from the pose {start[i]:g}, want "
-                    f"{allowed:.3g} at most; is it another arm's or in another order or unit? Else raise `first`",
-                    cause="max_step",
-                )
-            if v < math.inf:  # the policy's own acceleration needs the other half
-                ramp = max(ramp, 2 * v / a, 2 * v / j)
-            near = near and way <= v
+        for i, (way, speed) in enumerate(zip(ways.tolist(), speeds.tolist(), strict=True)):
+            v, a, j = (self._softness() * limit[i] for limit in (velocity, acceleration, jerk))
+            v_plan = v if v < math.inf else 2 * speed
+            if i not in at_once:  # the policy's own acceleration needs the other half
+                ramp = max(ramp, 2 * v_plan / a, 2 * v_plan / j)
             # The peaks of the quintic over T ticks: 1.875 D / T, 5.7735 D / T^2, 60 D / T^3.
             slow = (1.875 * way / v, math.sqrt(5.7735 * way / a), (60 * way / j) ** (1 / 3))
-            approach = max(approach, *(one * _SLOWLY for one in slow))
-        ticks = 0 if near or self._relative else math.ceil(approach)
-        return EaseIn(start, ticks, 2 * math.ceil(ramp / 2), relative=self._relative)
+            approach = max(approach, *(_SLOWLY * ticks for ticks in slow))
+        ticks = math.ceil(approach) if self._deltas else max(1, math.ceil(approach))
+        return EaseIn(start, ticks, 2 * math.ceil(ramp / 2), deltas=self._deltas, at_once=at_once)
+
+    def _check_first(self, limits: Limits, start: np.ndarray, goal: np.ndarray, velocity: list[float]) -> None:
+        """Raise `InvalidAction` if the first action is too far from the pose at rest."""
+        dim, hz = len(goal), self.hz or 0.0
+        if limits.first is None:
+            allowed = [limit * hz * _FIRST_S for limit in velocity]
+        else:
+            allowed = np.broadcast_to(np.asarray(limits.first, np.float64), dim).tolist()
+        for i, (begin, end) in enumerate(zip(start.tolist(), goal.tolist(), strict=True)):
+            way = abs(end - begin)
+            if way > allowed[i] + 2 * _ROUNDING * max(abs(begin), abs(end)):
+                raise InvalidAction(
+                    f"action[{i}]: got {end:g} as the first action, {way:g} from the pose {begin:g}, want "
+                    f"{allowed[i]:.3g} at most; is it another arm's or in another order or unit? Else raise `first`",
+                    cause="max_step",
+                )
+
+    def _speeds(self, plan: np.ndarray) -> np.ndarray:
+        """Return the largest speed of each number in the rows of a plan, (D,) units a tick."""
+        rows = np.atleast_2d(plan).astype(np.float64)
+        speeds: np.ndarray = np.abs(np.diff(rows, axis=0)).max(0, initial=0.0)
+        speeds[self._deltas] = np.abs(rows[:, self._deltas]).max(0)
+        return speeds
 
     def way_to_rest(self, last: np.ndarray) -> Iterator[np.ndarray]:
         """Yield the commands, (D,) float32, of the slow way from the last one to the rest pose, if `limits` has one."""
-        if self.limits is None or self.limits.rest is None or self._relative:
+        if self.limits is None or self.limits.rest is None:
             return
-        rest = np.array(self.limits.rest, np.float32)
+        self._limits_of(len(last))
+        rest = last.copy()
+        for number, pose in enumerate(self.limits.rest):
+            if pose is not None:
+                rest[number] = pose
         ease = self.ease_in(last, rest, far=True)
         yield last  # the way begins at rest
         while ease is not None and not ease.arrived:
@@ -216,20 +262,52 @@ class Guard:
             yield command
 
     def _limits_of(self, dim: int) -> list[list[float]]:
+        """Return the limits of each number of an action; raises `ConfigError` if they do not fit its meaning."""
         if not self._columns or len(self._columns[0]) != dim:
             limits, tick_s = self.limits or Limits(), 1.0 / (self.hz or 1.0)
-            of_time = (limits.velocity, limits.acceleration, limits.jerk)
-            given = [(self._low, -math.inf), (self._high, math.inf), (self._max_step, math.inf)]
+            self._grippers = self._spec.gripper_columns(dim)
+            self._deltas = self._spec.delta_columns(dim)
             try:
-                found = [np.broadcast_to(other if one is None else one, dim).tolist() for one, other in given]
-                for order, one in enumerate(of_time, 1):
-                    limit = np.broadcast_to(math.inf if one is None else np.asarray(one, np.float64), dim)
-                    # Float32 rounds a step of 0.1 between two targets to slightly more.
-                    found.append((limit * tick_s**order * (1 + 1e-4) + 1e-6).tolist())
+                columns = [
+                    np.broadcast_to(-math.inf if self._low is None else self._low, dim).tolist(),
+                    np.broadcast_to(math.inf if self._high is None else self._high, dim).tolist(),
+                    _tolerant(math.inf if self._max_step is None else self._max_step, dim),
+                ]
+                for order, limit in enumerate((limits.velocity, limits.acceleration, limits.jerk), 1):
+                    per_s = math.inf if limit is None else np.asarray(limit, np.float64)
+                    columns.append(_tolerant(per_s * tick_s**order, dim))
+                np.broadcast_to(0.0 if limits.first is None else limits.first, dim)
             except ValueError as error:
                 raise ConfigError(f"limits: {error}; want one number, or {dim} as an action has") from error
-            self._columns = found
+            if any(low > high for low, high in zip(columns[0], columns[1], strict=True)):
+                raise ConfigError(f"low and high: expected low below high, got {columns[0]} and {columns[1]}")
+            self._check_places(limits, dim)
+            self._columns = columns
         return self._columns
+
+    def _check_places(self, limits: Limits, dim: int) -> None:
+        """Raise `ConfigError` if a limit of places has no effect, or would move a gripper."""
+        if limits.rest is not None and len(limits.rest) != dim:
+            raise ConfigError(f"rest: expected {dim} numbers, as an action has, got {len(limits.rest)}")
+        moved = [] if limits.rest is None else [i for i in self._grippers if limits.rest[i] is not None]
+        if moved:
+            raise ConfigError(
+                f"rest: expected null for the grippers, numbers {moved}, as the way to rest keeps what they hold; got "
+                f"{limits.rest}"
+            )
+        if not self._deltas:
+            return
+        places = ("first", "rest", "workspace_low", "workspace_high")
+        without_effect = [name for name in places if getattr(limits, name) is not None]
+        for name in ("low", "high"):
+            bound = getattr(limits, name)
+            if bound is not None and np.isfinite(np.broadcast_to(bound, dim)[self._deltas]).any():
+                without_effect.append(name)
+        if without_effect:
+            raise ConfigError(
+                f"limits: got {', '.join(without_effect)} for relative actions, which cannot be compared with a place; "
+                "remove them, or use a file with velocity, acceleration and jerk alone"
+            )
 
     def _softness(self) -> float:
         """Return the share of the limits of speed, acceleration and jerk that applies now."""
@@ -237,17 +315,23 @@ class Guard:
 
     def _check_dynamics(self, now: list[float], then: list[float], limits: Sequence[list[float]]) -> None:
         zeros = [0.0] * len(now)
-        speeds, changes = (zeros, zeros) if then != self._then else (self._speed, self._change)
-        moved = now if self._relative else [a - b for a, b in zip(now, then, strict=True)]
+        continues = then == self._then
+        speeds, changes = (self._speed, self._change) if continues else (zeros.copy(), zeros)
+        moved = [a - b for a, b in zip(now, then, strict=True)]
+        for i in self._deltas:
+            moved[i] = now[i]
+            speeds[i] = then[i]
         share = self._softness()
         for i, (v, u, c, *limit) in enumerate(zip(moved, speeds, changes, *limits, strict=True)):
-            if abs(v) > share * limit[0]:
+            # An action's rounding to float32 counts twice in a speed, and twice as often in each further difference.
+            rounding = 2 * _ROUNDING * max(abs(now[i]), abs(then[i]))
+            if abs(v) > share * limit[0] + rounding:
                 raise self._refusal("velocity", i, v, share * limit[0], 1)
             if abs(v) <= abs(u) and v * u >= 0.0:  # it brakes
                 continue
-            if abs(v - u) > share * limit[1]:
+            if abs(v - u) > share * limit[1] + 2 * rounding:
                 raise self._refusal("acceleration", i, v - u, share * limit[1], 2)
-            if abs(v - u - c) > share * limit[2]:
+            if abs(v - u - c) > share * limit[2] + 4 * rounding:
                 raise self._refusal("jerk", i, v - u - c, share * limit[2], 3)
         # After a tick at rest, the deceleration before it is over.
         self._change = [v - u for v, u in zip(moved, speeds, strict=True)] if any(moved) else zeros
@@ -289,6 +373,11 @@ def _bounds(name: str, stricter: np.ufunc, *given: float | np.ndarray | tuple[fl
     if any(np.isnan(one).any() for one in stated):
         raise ConfigError(f"{name}: got {given}, want numbers")
     return functools.reduce(stricter, stated) if stated else None
+
+
+def _tolerant(limit: float | np.ndarray, dim: int) -> list[float]:
+    """Return the limit of each number, with a tolerance, as float32 rounds a step of 0.1 to slightly more."""
+    return (np.broadcast_to(limit, dim) * (1 + 1e-4) + 1e-6).tolist()  # type: ignore[no-any-return]
 
 
 class Watchdog:

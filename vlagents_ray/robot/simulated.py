@@ -21,7 +21,7 @@ class SimulatedRobot:
     """An arm whose joints follow their commands, shown as a dot on a still image by its cameras.
 
     Actions are those of the policy's contract: `dim` numbers, deltas of the joints or absolute targets (also if neither
-    is stated), the last one the gripper if the contract states its opening. Observations have the cameras, with their
+    is stated), with the grippers of `ActionSpec.gripper_columns`. Observations have the cameras, with their
     sizes, and the parts of the state, filled with the joints, that the contract names; without a contract they have the
     cameras `front` and `wrist` and the part `joints`.
     """
@@ -41,6 +41,7 @@ class SimulatedRobot:
             channels = [x * 200 // width + noise, y * 200 // height + noise, (x + y) % 160 + noise]
             self._pictures[name] = np.stack(channels, -1).astype(np.uint8)
         self._joints = np.zeros(self._action.dim or 7, np.float32)
+        self._grippers = self._action.gripper_columns(len(self._joints))
         self._target = self._joints.copy()
         self.applied = 0  # actions
         self.stopped = False
@@ -54,7 +55,8 @@ class SimulatedRobot:
         }
         opened, closed, opening = self._action.gripper_open, self._action.gripper_closed, 1.0
         if opened is not None and closed is not None and opened != closed:
-            opening = min(1.0, max(0.0, (float(self._joints[-1]) - closed) / (opened - closed)))
+            position = float(self._joints[self._grippers].mean())
+            opening = min(1.0, max(0.0, (position - closed) / (opened - closed)))
         images = {name: still.copy() for name, still in self._pictures.items()}
         turn = float(self._joints[0])
         for image in images.values():
@@ -68,14 +70,16 @@ class SimulatedRobot:
         """Set the targets of the joints, rad."""
         self.applied += 1
         self.stopped = False
-        if self._action.relative:
-            self._target = self._target + action
-        else:
-            self._target = action.copy()
+        deltas = self._action.delta_columns(len(action))
+        target = action.copy()
+        target[deltas] += self._target[deltas]
+        self._target = target
 
     def stop(self) -> None:
-        """Make the current position of the joints their target."""
-        self._target = self._joints.copy()
+        """Make the current position of the joints their target; the grippers keep their grasp."""
+        held = self._joints.copy()
+        held[self._grippers] = self._target[self._grippers]
+        self._target = held
         self.stopped = True
 
 

@@ -49,8 +49,8 @@ class AxesLeader:
     """A leader that turns the axes of a device into actions.
 
     Axis i moves number i of the action: for relative actions of an end effector x, y, z and, if the action has them,
-    rotations; else the first six joints. The gripper is the last number, if the contract states its opening. At a
-    takeover it stays open if it is fully open; else it is closed, as it may hold something.
+    rotations; else the first six joints. The gripper is that of `ActionSpec.gripper_columns`. At a takeover it stays
+    open if it is fully open; else it is closed, as it may hold something.
 
     Args:
         contract: The policy's contract, which states `action.dim`, and whether actions are relative.
@@ -61,7 +61,8 @@ class AxesLeader:
             targets begin; default: the state's part `joints`, with the gripper's command after it.
 
     Raises:
-        ConfigError: The contract is incomplete, or `step` is missing or not above 0.
+        ConfigError: The contract is incomplete, or has several grippers, which one button cannot keep; or `step` is
+            missing or not above 0.
     """
 
     def __init__(
@@ -87,6 +88,18 @@ class AxesLeader:
             )
         self._spec, self._device, self._step = spec, device, step
         self._dim = spec.dim
+        self._grippers = spec.gripper_columns(spec.dim)
+        if len(self._grippers) > 1:
+            raise ConfigError(
+                f"teleoperation: expected at most one gripper, got the columns {self._grippers} of the arms "
+                f"{spec.arms}; the device has one button, and would move a gripper that the operator does not see to; "
+                "write a leader for both arms"
+            )
+        if self._grippers and (spec.gripper_open is None or spec.gripper_closed is None):
+            raise ConfigError(
+                "teleoperation: expected both `gripper_open` and `gripper_closed` in the contract's action, got "
+                f"{spec.gripper_open} and {spec.gripper_closed}; state both in the policy's contract"
+            )
         self._measure = measure
         self._engaged = False
         self._closed: bool | None = None  # None: as at the takeover
@@ -107,12 +120,11 @@ class AxesLeader:
     def action(self, obs: Obs) -> np.ndarray:
         """Return the action of the axes as read last, (D,) float32."""
         spec, axes = self._spec, self._device.axes()
-        gripper = spec.gripper_open is not None and spec.gripper_closed is not None
         moved = np.zeros(self._dim, np.float32)
-        n = min(self._dim - gripper, len(axes))
+        n = min(self._dim - len(self._grippers), len(axes))
         moved[:n] = self._step * axes[:n]
         command = None
-        if gripper:
+        if self._grippers:
             if self._closed is None:
                 self._closed = obs.gripper is not None and obs.gripper < _FULLY_OPEN
             if self._device.gripper_presses() % 2:
@@ -130,7 +142,7 @@ class AxesLeader:
                 moved = np.clip(moved, spec.low, spec.high)
             self._target = moved
         if command is not None:
-            moved[-1] = command
+            moved[self._grippers] = command
         return moved.astype(np.float32)
 
 

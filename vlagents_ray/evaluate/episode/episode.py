@@ -266,7 +266,7 @@ class _Episode:
             if self._width not in (None, rows.shape[1]):  # if the environment's contract states no size
                 raise InvalidAction(f"action: got {rows.shape}, want {self._width} numbers a row, as in the first")
             self._width = rows.shape[1]
-            ticks = list(self._executor.ticks(rows, latency_s or 0.0, answer.info))
+            ticks = list(self._executor.ticks(rows, latency_s or 0.0, answer.info, done=answer.done))
             self.observer.add_act(answer, sum(tick.waited for tick in ticks))
             self.ticks.extend(ticks)
             self._done = answer.done

@@ -74,16 +74,21 @@ class ChunkExecutor:
         """Return the `Obs.info` for real-time chunking: the remaining rows; {} if there are none or it is off."""
         return self._plan.continuation(self._delay.ticks) if self._clock.real_time_chunking else {}
 
-    def ticks(self, rows: np.ndarray, latency_s: float, info: Mapping[str, Any] | None = None) -> Iterator[Tick]:
+    def ticks(
+        self, rows: np.ndarray, latency_s: float, info: Mapping[str, Any] | None = None, *, done: bool = False
+    ) -> Iterator[Tick]:
         """Return the ticks until the next request, after an answer of `rows`, (H, D), with `latency_s` and `info`.
+
+        After an answer with `done` there is no next request: all its rows are executed.
 
         Raises:
             ConfigError: No row is left for real-time chunking.
         """
+        execute = None if done else self._execute
         if not self._real_time:
-            yield from map(Tick, rows[: self._execute])
+            yield from map(Tick, rows[:execute])
             return
-        if self._clock.real_time_chunking and len(rows) <= (self._execute or len(rows)):
+        if self._clock.real_time_chunking and not done and len(rows) <= (execute or len(rows)):
             raise ConfigError(
                 f"clock.real_time_chunking: got chunks of {len(rows)} rows, all of which are executed before the next "
                 "request, so that nothing is left to continue; give an `execute` below that, and none in the policy"
@@ -102,7 +107,7 @@ class ChunkExecutor:
         first = self._plan.take()
         self._last = first.action
         yield Tick(first.action)
-        for action in rows[first.row + 1 : self._execute]:
+        for action in rows[first.row + 1 : execute]:
             self._plan.advance()
             self._last = action
             yield Tick(action)

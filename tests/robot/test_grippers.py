@@ -1,0 +1,246 @@
+"""No producer of commands changes a gripper on its own: each of them, for both kinds of actions, one arm and two."""
+
+from __future__ import annotations
+
+import itertools
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from vlagents_ray import Act, ActionSpec, Agent, ChunkPlayer, ConfigError, Contract, Obs, PlayerSettings
+from vlagents_ray.chunking.fallback import SafeAction, neutral
+from vlagents_ray.errors import PolicyUnavailable
+from vlagents_ray.interface import SAFE
+from vlagents_ray.robot import Guard, Limits, run_loop
+from vlagents_ray.robot.simulated import SimulatedRobot
+from vlagents_ray.robot.teleoperation import AxesDevice, AxesLeader
+
+HZ = 50.0
+OPEN, CLOSED = 1.0, -1.0
+NO_LIMIT = float("inf")
+KINDS = [
+    pytest.param(delta, arms, id=f"{'relative' if delta else 'absolute'}, {arms} arms")
+    for delta, arms in itertools.product((False, True), (1, 2, 3))
+]
+
+
+def spec_of(delta: bool, arms: int) -> ActionSpec:
+    """Return actions of three joints and a gripper for each arm."""
+    names = tuple(f"arm{i}" for i in range(arms)) if arms > 1 else None
+    return ActionSpec(dim=4 * arms, space="joint", delta=delta, gripper_open=OPEN, gripper_closed=CLOSED, arms=names)
+
+
+def limits_of(arms: int, gripper: float) -> Limits:
+    """Return limits with a speed of the grippers, units/s."""
+    return Limits(
+        velocity=(1.0, 1.0, 1.0, gripper) * arms,
+        acceleration=(20.0, 20.0, 20.0, 20 * gripper) * arms,
+        jerk=(800.0, 800.0, 800.0, 800 * gripper) * arms,
+    )
+
+
+def test_the_columns_are_the_last_of_each_arms_part() -> None:
+    assert spec_of(False, 1).gripper_columns(4) == [3]
+    assert spec_of(True, 2).gripper_columns(8) == [3, 7]
+    assert spec_of(True, 2).delta_columns(8) == [0, 1, 2, 4, 5, 6]
+    assert spec_of(False, 2).delta_columns(8) == []
+    assert ActionSpec(delta=True).gripper_columns(7) == []
+    assert ActionSpec(gripper_closed=0.0).gripper_columns(7) == [6], "also if only one of its ends is stated"
+
+
+UNEQUAL = ActionSpec(dim=15, delta=True, gripper_open=1.0, gripper_closed=0.0, arms=("left", "right"))
+
+
+@pytest.mark.parametrize(
+    "use",
+    [
+        lambda: SafeAction("auto", UNEQUAL),
+        lambda: neutral(UNEQUAL),
+        lambda: Guard(Contract(action=UNEQUAL)),
+        lambda: SimulatedRobot(Contract(action=UNEQUAL)),
+        lambda: AxesLeader(Contract(action=UNEQUAL), Device(), step=0.1),
+    ],
+    ids=["safe action", "neutral action", "guard", "simulated robot", "leader"],
+)
+def test_arms_that_do_not_share_the_numbers_equally_are_an_error_of_each_user(use) -> None:  # type: ignore[no-untyped-def]
+    with pytest.raises(ConfigError, match="2 arms"):
+        use()
+
+
+@pytest.mark.parametrize(("delta", "arms"), KINDS)
+def test_a_safe_action_keeps_each_gripper_and_the_neutral_one_opens_all(delta: bool, arms: int) -> None:
+    spec = spec_of(delta, arms)
+    columns = spec.gripper_columns(4 * arms)
+    last = np.random.default_rng(0).uniform(-1, 1, 4 * arms).astype(np.float32)
+    assert (SafeAction("auto", spec)(Obs(), last)[columns] == last[columns]).all()
+    assert (neutral(spec)[columns] == OPEN).all()
+
+
+class Grasping(Agent):
+    """A policy whose grippers close and open in turn; now and then its server is gone."""
+
+    contract: Contract | None = None
+
+    def __init__(self, spec: ActionSpec, seed: int, largest_change: float) -> None:
+        self.contract = Contract(action=spec, chunk=40)
+        self._spec = spec
+        self._random = np.random.default_rng(seed)
+        self._change = largest_change
+        self.rows = np.zeros((0, spec.dim or 0), np.float32)  # of all answers
+        self._gripper = np.array([OPEN, CLOSED, OPEN][: len(spec.gripper_columns(spec.dim or 0))])
+
+    def act(self, obs: Obs) -> Act:
+        if len(self.rows) and self._random.random() < 0.3:
+            raise PolicyUnavailable("the server restarts")
+        spec, dim = self._spec, self._spec.dim or 0
+        rows = np.full((40, dim), 0.003)
+        if not spec.relative:
+            rows = obs.state["joints"] + np.cumsum(rows, axis=0)
+        for row in rows:
+            target = np.where(self._random.random(len(self._gripper)) < 0.1, -self._gripper, self._gripper)
+            change = np.clip(target - self._gripper, -self._change, self._change)
+            self._gripper = np.clip(self._gripper + change, CLOSED, OPEN)
+            row[spec.gripper_columns(dim)] = self._gripper
+        self.rows = np.concatenate([self.rows, rows.astype(np.float32)])
+        return Act(rows.astype(np.float32))
+
+
+@pytest.mark.parametrize(("delta", "arms"), KINDS)
+@pytest.mark.parametrize("mode", ["open_loop", "async"])
+@pytest.mark.parametrize("seed", range(3))
+def test_a_grippers_command_is_the_last_one_or_the_policys(delta: bool, arms: int, mode: str, seed: int) -> None:
+    """Ease-in, hold, lost answers, pauses and stops change no gripper that has no limits."""
+    spec = spec_of(delta, arms)
+    columns = spec.gripper_columns(4 * arms)
+    policy = Grasping(spec, seed, largest_change=2.0)
+    joints = np.full(4 * arms, 0.3, np.float32)
+    measure = None if delta else (lambda obs: obs.state["joints"])
+    guard = Guard(policy.contract, limits=limits_of(arms, NO_LIMIT), hz=HZ, measure=measure)
+    random = np.random.default_rng(seed)
+    last: np.ndarray | None = None
+    held = 0
+    settings = PlayerSettings(mode, deadline_s=30.0, execute=None if mode == "open_loop" else 10)  # type: ignore[arg-type]
+    with ChunkPlayer(policy, settings, check=guard) as player:
+        player.initialize()
+        player.reset(Obs(state={"joints": joints}))
+        for _ in range(400):
+            event = random.choice(["none", "pause", "stop"], p=[0.97, 0.02, 0.01])
+            if event == "pause":
+                player.control.pause()
+            elif event == "stop" and last is not None:
+                player.act(Obs(state={"joints": joints}))  # is not executed
+                player.interrupt()
+                joints = joints + np.float32(0.2) * np.isin(np.arange(len(joints)), columns)  # the fingers give way
+            act = player.act(Obs(state={"joints": joints}))
+            player.control.resume()
+            held += SAFE in act.info
+            grippers = act.action[columns]
+            if SAFE in act.info and last is not None:
+                assert (grippers == last[columns]).all(), act.info[SAFE]
+            for column, command in zip(columns, grippers.tolist(), strict=True):
+                of_the_policy = set(policy.rows[:, column].tolist())
+                of_before = {0.3} if last is None else {float(last[column])}
+                assert command in of_the_policy | of_before, "half open"
+            last = act.action
+            if not delta:
+                joints = act.action.copy()
+    assert held > 0
+
+
+@pytest.mark.parametrize(("delta", "arms"), KINDS)
+def test_a_gripper_with_limits_goes_from_the_last_command_to_the_policys_and_not_back(delta: bool, arms: int) -> None:
+    spec = spec_of(delta, arms)
+    columns = spec.gripper_columns(4 * arms)
+
+    class Closing(Agent):
+        contract = Contract(action=spec, chunk=200)
+        closes = False
+
+        def act(self, obs: Obs) -> Act:
+            row = np.zeros(4 * arms, np.float32) if delta else obs.state["joints"].copy()
+            row[columns] = CLOSED if self.closes else OPEN
+            return Act(np.tile(row, (200, 1)))
+
+    policy = Closing()
+    joints = np.zeros(4 * arms, np.float32)
+    joints[columns] = OPEN
+    measure = None if delta else (lambda obs: obs.state["joints"])
+    limits = limits_of(arms, 2.0) if delta else replace(limits_of(arms, 2.0), first=3.0)
+    guard = Guard(policy.contract, limits=limits, hz=HZ, measure=measure, soft_start_s=0)
+    with ChunkPlayer(policy, PlayerSettings(deadline_s=30.0), check=guard) as player:
+        player.initialize()
+        player.reset(Obs(state={"joints": joints}))
+        first, _ = (player.act(Obs(state={"joints": joints})).action for _ in range(2))
+        policy.closes = True
+        player.interrupt()
+        commands = [first] + [player.act(Obs(state={"joints": joints})).action for _ in range(300)]
+    path = np.array(commands)[:, columns]
+    assert (np.diff(path, axis=0) <= 1e-6).all(), "closes, and never opens"
+    assert np.abs(np.diff(path, axis=0)).max() * HZ <= 2.0 * 1.001
+    assert np.allclose(path[-1], CLOSED)
+
+
+@pytest.mark.parametrize("arms", [1, 2])
+def test_the_way_to_rest_keeps_the_grippers(arms: int) -> None:
+    spec = spec_of(False, arms)
+    rest = (0.1, 0.2, 0.3, None) * arms
+    guard = Guard(Contract(action=spec), limits=replace(limits_of(arms, 1.0), rest=rest), hz=HZ)
+    last = np.array([0, 0, 0, -0.4, 0, 0, 0, 0.6][: 4 * arms], np.float32)
+    way = np.array(list(guard.way_to_rest(last)))
+    columns = spec.gripper_columns(4 * arms)
+    assert (way[:, columns] == last[columns]).all()
+    assert np.allclose(np.delete(way[-1], columns), (0.1, 0.2, 0.3) * arms)
+
+
+class Device(AxesDevice):
+    def __init__(self) -> None:
+        self.moves = np.zeros(6, np.float32)
+
+    def engaged(self) -> bool:
+        return True
+
+    def axes(self) -> np.ndarray:
+        return self.moves
+
+    def press(self) -> None:
+        self._presses += 1
+
+
+@pytest.mark.parametrize("delta", [False, True])
+def test_a_leader_moves_the_gripper_at_a_press_alone_and_refuses_several(delta: bool) -> None:
+    device = Device()
+    leader = AxesLeader(Contract(action=spec_of(delta, 1)), device, step=0.1)
+    obs = Obs(state={"joints": np.zeros(3, np.float32)}, gripper=0.3)
+    leader.engaged()
+    device.moves = np.ones(6, np.float32)
+    assert {float(leader.action(obs)[3]) for _ in range(5)} == {CLOSED}
+    device.press()
+    assert {float(leader.action(obs)[3]) for _ in range(5)} == {OPEN}
+    with pytest.raises(ConfigError, match=r"at most one gripper, got the columns \[3, 7\]"):
+        AxesLeader(Contract(action=spec_of(delta, 2)), device, step=0.1)
+    half = ActionSpec(dim=4, delta=delta, gripper_open=1.0)
+    with pytest.raises(ConfigError, match="both `gripper_open` and `gripper_closed`"):
+        AxesLeader(Contract(action=half), device, step=0.1)
+
+
+@pytest.mark.parametrize(("delta", "arms"), KINDS)
+def test_a_simulated_robot_has_its_grippers_where_they_were_commanded(delta: bool, arms: int) -> None:
+    spec = spec_of(delta, arms)
+    columns = spec.gripper_columns(4 * arms)
+
+    class Still(Agent):
+        contract = Contract(action=spec, chunk=10)
+
+        def act(self, obs: Obs) -> Act:
+            rows = np.zeros((10, 4 * arms), np.float32)
+            rows[:, columns] = CLOSED
+            return Act(rows)
+
+    robot = SimulatedRobot(Still.contract)
+    with ChunkPlayer(Still(), PlayerSettings(deadline_s=30.0)) as player:
+        run_loop(robot, player, hz=200, seconds=0.3)
+    assert np.allclose(robot._target[columns], CLOSED)
+    for _ in range(60):
+        opening = robot.observe().gripper
+    assert opening == pytest.approx(0.0, abs=1e-3)

@@ -1,0 +1,371 @@
+"""Limits of motion for both kinds of actions, one arm and two: no accepted sequence exceeds them, from the first on."""
+
+from __future__ import annotations
+
+import itertools
+import json
+from dataclasses import fields
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from vlagents_ray import Act, ActionSpec, Agent, ChunkPlayer, ConfigError, Contract, Obs, PlayerSettings
+from vlagents_ray.errors import InvalidAction
+from vlagents_ray.interface import SAFE
+from vlagents_ray.robot import Guard, Limits
+from vlagents_ray.robot.dataset import Dataset
+
+HZ = 50.0
+SPEED, ACCELERATION, JERK = 1.0, 20.0, 800.0
+LIMITS = Limits(velocity=SPEED, acceleration=ACCELERATION, jerk=JERK)
+KINDS = [
+    pytest.param(delta, arms, id=f"{'relative' if delta else 'absolute'}, {arms or 1} arms")
+    for delta, arms in itertools.product((False, True), (None, 2))
+]
+URDF = """<robot name="arm"><joint name="pan" type="revolute"><parent link="base"/><child link="hand"/>
+<axis xyz="0 0 1"/><limit lower="-1" upper="1" velocity="2"/></joint></robot>"""
+
+
+def spec_of(delta: bool, arms: int | None) -> ActionSpec:
+    """Return actions of two joints and a gripper for each arm."""
+    names = None if arms is None else tuple(f"arm{i}" for i in range(arms))
+    dim = 3 * (arms or 1)
+    return ActionSpec(dim=dim, space="joint", delta=delta, gripper_open=1.0, gripper_closed=0.0, arms=names)
+
+
+def path_of(spec: ActionSpec, actions: list[np.ndarray]) -> np.ndarray:
+    """Return the motion that actions command from rest, (T + 3, D); deltas are summed up."""
+    rows = np.array(actions, np.float64)
+    deltas = spec.delta_columns(rows.shape[1])
+    rows[:, deltas] = np.cumsum(rows[:, deltas], axis=0)
+    rest = rows[0].copy()
+    rest[deltas] = 0.0
+    return np.concatenate([[rest] * 3, rows])
+
+
+def require_within(path: np.ndarray, limits: Limits, hz: float = HZ) -> None:
+    """Raise if a path speeds up beyond the limits; braking is always allowed."""
+    speeds = np.diff(path, axis=0)
+    for before, now, change_before in zip(speeds[1:-1], speeds[2:], np.diff(speeds, axis=0)[:-1], strict=True):
+        change = now - before
+        brakes = (np.abs(now) <= np.abs(before)) & (now * before >= 0)
+        assert (np.abs(now) * hz <= np.asarray(limits.velocity) * 1.001 + 1e-4).all()
+        assert (brakes | (np.abs(change) * hz**2 <= np.asarray(limits.acceleration) * 1.001 + 1e-2)).all()
+        # A tick at rest ends the deceleration before it.
+        rested = ~before.any()
+        jerk = np.abs(change if rested else change - change_before) * hz**3
+        assert (brakes | (jerk <= np.asarray(limits.jerk) * 1.001 + 1.0)).all()
+
+
+@pytest.mark.parametrize(("delta", "arms"), KINDS)
+@pytest.mark.parametrize("seed", range(4))
+def test_no_accepted_sequence_exceeds_the_limits_from_the_first_action_on(
+    delta: bool, arms: int | None, seed: int
+) -> None:
+    spec = spec_of(delta, arms)
+    guard = Guard(Contract(action=spec), limits=LIMITS, hz=HZ, soft_start_s=0)
+    random = np.random.default_rng(seed)
+    accepted: list[np.ndarray] = []
+    deltas = spec.delta_columns(spec.dim or 0)
+    last, motion = None, np.zeros(spec.dim or 0)
+    for _ in range(2000):
+        scale = 10 ** random.uniform(-4.5, 0.5)
+        motion = motion * random.uniform(0.5, 1.2) + random.normal(0, scale, len(motion))
+        position = np.zeros(len(motion)) if last is None else last.astype(np.float64)
+        position[deltas] = 0.0
+        action = (position + motion).astype(np.float32)
+        try:
+            last = guard(action, last)
+        except InvalidAction:
+            motion = np.zeros(len(motion))
+        else:
+            accepted.append(last)
+    assert len(accepted) > 30
+    require_within(path_of(spec, accepted), LIMITS)
+
+
+@pytest.mark.parametrize(("delta", "arms"), KINDS)
+@pytest.mark.parametrize("step", [0.5, 0.01, 0.002])
+def test_no_command_of_a_player_exceeds_the_limits_from_the_first_one_and_after_a_stop(
+    delta: bool, arms: int | None, step: float
+) -> None:
+    spec = spec_of(delta, arms)
+    dim = spec.dim or 0
+
+    class Straight(Agent):
+        contract = Contract(action=spec, chunk=100)
+
+        def act(self, obs: Obs) -> Act:
+            rows = np.full((100, dim), step, np.float32)
+            if not delta:
+                rows = obs.state["joints"] + np.cumsum(rows, axis=0, dtype=np.float32)
+            rows[:, spec.gripper_columns(dim)] = 0.5
+            return Act(rows)
+
+    pose = np.full(dim, 0.5, np.float32)
+    measure = None if delta else (lambda obs: obs.state["joints"])
+    guard = Guard(Contract(action=spec), limits=LIMITS, hz=HZ, soft_start_s=0, measure=measure)
+    still = np.zeros(dim, np.float32)
+    still[spec.gripper_columns(dim)] = 0.5
+    settings = PlayerSettings(deadline_s=30.0, safe=still if delta else "hold")
+    with ChunkPlayer(Straight(), settings, check=guard) as player:
+        player.initialize()
+        player.reset(Obs(state={"joints": pose}))
+        commands = [still if delta else pose]
+        runs, moved = [commands], 0
+        for tick in range(200):
+            if tick in (3, 80):  # the robot stands
+                player.interrupt()
+                commands = [still if delta else pose]
+                runs.append(commands)
+            act = player.act(Obs(state={"joints": pose}))
+            moved += SAFE not in act.info
+            commands.append(act.action)
+            if not delta:
+                pose = act.action.copy()
+    for commands in runs:
+        require_within(path_of(spec, commands), LIMITS)
+    if step * HZ <= SPEED:
+        assert moved == 200, "a plan within the limits is executed"
+    else:
+        assert player._plan.executed < 5, "of a plan beyond the limits, only the slow way to its first row is"
+
+
+@pytest.mark.parametrize("delta", [False, True])
+@pytest.mark.parametrize("limit", [0.05, 0.1, 0.3, 5.0])
+@pytest.mark.parametrize("position", [0.0, 0.7, 3.1, 90.0, 179.0])
+def test_a_step_of_exactly_the_limit_is_inside_in_float32(delta: bool, limit: float, position: float) -> None:
+    contract = Contract(action=ActionSpec(dim=1, delta=delta))
+    guards = {
+        "max_step": Guard(contract, max_step=limit),
+        "velocity": Guard(contract, limits=Limits(velocity=limit * HZ), hz=HZ, soft_start_s=0),
+        "acceleration": Guard(contract, limits=Limits(acceleration=limit * HZ**2), hz=HZ, soft_start_s=0),
+        "jerk": Guard(contract, limits=Limits(jerk=limit * HZ**3), hz=HZ, soft_start_s=0),
+    }
+    for offset in np.linspace(0, 1, 200):
+        begin = np.array([0.0 if delta else position + offset], np.float32)
+        at_the_limit = np.array([limit if delta else position + offset + limit], np.float32)
+        beyond = np.array([1.01 * limit if delta else position + offset + 1.01 * limit], np.float32)
+        for guard in guards.values():
+            guard(at_the_limit, guard(begin))
+            with pytest.raises(InvalidAction):
+                guard(beyond, guard(begin))
+
+
+@pytest.mark.parametrize("bound", [0.1, 1.7, 3.14159265])
+def test_a_bound_is_inside_in_float32(bound: float) -> None:
+    guard = Guard(limits=Limits(low=-bound, high=bound), hz=HZ)
+    for sign in (-1, 1):
+        guard(np.array([sign * bound], np.float32))
+
+
+def test_the_distance_of_the_first_action_is_limited_by_first_alone_if_it_is_given() -> None:
+    for first, velocity, accepted in (
+        (None, 1.0, 0.5),
+        (0.3, 1.0, 0.3),
+        (1.0, 1.0, 1.0),
+        (5.0, 1.0, 5.0),
+        (1, None, 1),
+    ):
+        limits = Limits(velocity=velocity, acceleration=10.0, jerk=500.0, first=first)
+        guard = Guard(limits=limits, hz=HZ, soft_start_s=0)
+        zero = np.zeros(2, np.float32)
+        assert guard.ease_in(zero, np.array([0, accepted], np.float32)) is not None
+        with pytest.raises(InvalidAction, match=f"want {accepted:.3g} at most"):
+            guard.ease_in(zero, np.array([0, 1.01 * accepted], np.float32))
+
+
+# Each key of a file has an effect, or is an error.
+
+EFFECTS: dict[str, tuple[dict[str, object], list[list[float]]]] = {
+    # the smallest file with a key, and a sequence of actions that it refuses
+    "low": ({"low": 0.0}, [[-0.1]]),
+    "high": ({"high": [1.0]}, [[1.1]]),
+    "velocity": ({"velocity": 1.0}, [[0], [0.03]]),
+    "acceleration": ({"acceleration": 10.0}, [[0], [0.01]]),
+    "jerk": ({"jerk": 100.0}, [[0], [0.01]]),
+    "urdf": ({"urdf": "arm.urdf"}, [[1.1]]),
+    "unit": ({"urdf": "arm.urdf", "unit": "deg"}, [[60.0]]),
+    "joints": ({"urdf": "arm.urdf", "joints": ["pan"]}, [[1.1]]),
+    "tip": ({"urdf": "arm.urdf", "tip": "hand", "workspace_low": [0.1, 0, 0]}, [[0]]),
+    "workspace_low": ({"urdf": "arm.urdf", "tip": "hand", "workspace_low": [None, None, 0.1]}, [[0]]),
+    "workspace_high": ({"urdf": "arm.urdf", "tip": "hand", "workspace_high": [None, -0.1, None]}, [[0]]),
+}
+
+
+def written(folder: Path, document: dict[str, object]) -> Path:
+    (folder / "arm.urdf").write_text(URDF)
+    (folder / "limits.json").write_text(json.dumps(document))
+    return folder / "limits.json"
+
+
+def test_the_table_of_effects_has_each_key_of_a_file() -> None:
+    named = {field.name for field in fields(Limits)} - {"chain"} | {"urdf", "tip"}
+    assert {*EFFECTS, "first", "rest"} == named  # these two are not of a sequence of actions; see the tests of each
+
+
+@pytest.mark.parametrize("key", EFFECTS)
+def test_each_key_of_a_file_refuses_an_absolute_action(tmp_path: Path, key: str) -> None:
+    document, actions = EFFECTS[key]
+    guard = Guard(Contract(action=ActionSpec(dim=1, delta=False)), limits=written(tmp_path, document), hz=HZ)
+
+    def run() -> None:
+        last = None
+        for action in actions:
+            last = guard(np.array(action, np.float32), last)
+
+    with pytest.raises(InvalidAction):
+        run()
+
+
+@pytest.mark.parametrize("key", [*EFFECTS, "first", "rest"])
+def test_each_key_of_a_file_refuses_a_relative_action_or_is_an_error(tmp_path: Path, key: str) -> None:
+    document = {"first": {"first": 0.1}, "rest": {"rest": [0.1]}}.get(key) or EFFECTS[key][0]
+    path = written(tmp_path, document)
+    contract = Contract(action=ActionSpec(dim=1, delta=True))
+    if key in ("velocity", "acceleration", "jerk"):
+        guard = Guard(contract, limits=path, hz=HZ)
+        with pytest.raises(InvalidAction):
+            guard(np.array([0.03], np.float32))
+    else:
+        with pytest.raises(ConfigError, match="for relative actions"):
+            Guard(contract, limits=path, hz=HZ)
+
+
+def test_bounds_of_a_gripper_have_an_effect_for_relative_actions_as_well() -> None:
+    contract = Contract(action=spec_of(delta=True, arms=2))
+    limits = Limits(low=(-np.inf, -np.inf, 0.0) * 2, high=(np.inf, np.inf, 1.0) * 2)
+    guard = Guard(contract, limits=limits, hz=HZ)
+    guard(np.array([0, 0, 1, 0, 0, 0.5], np.float32))
+    with pytest.raises(InvalidAction, match=r"action\[2\]: got 1.1, above"):
+        guard(np.array([0, 0, 1.1, 0, 0, 0.5], np.float32))
+
+
+@pytest.mark.parametrize(
+    ("document", "said"),
+    [
+        *(({key: float("nan")}, key) for key in ("low", "high", "velocity", "acceleration", "jerk", "first")),
+        *(({key: [1.0, float("nan")]}, key) for key in ("low", "high", "velocity", "rest")),
+        ({"velocity": -1.0}, "velocity: expected numbers of 0 or more"),
+        ({"velocity": True}, "velocity: expected numbers"),
+        ({"rest": [float("inf")]}, "rest: expected finite"),
+        ({"unit": "deg"}, "unit: expected `urdf`"),
+        ({"joints": "pan"}, "joints: expected a list"),
+        ({"urdf": "arm.urdf", "tip": "hand"}, "tip, urdf and workspace"),
+        ({"workspace_low": [0, 0, 0]}, "tip, urdf and workspace"),
+        ({"urdf": "arm.urdf", "tip": "hand", "workspace_low": [0, 0]}, "workspace_low: expected x, y and z"),
+        ({"urdf": "arm.urdf", "tip": "hand", "workspace_low": [0, 0, float("nan")]}, "workspace_low"),
+    ],
+    ids=str,
+)
+def test_a_number_or_key_of_a_file_that_would_have_no_effect_is_an_error(
+    tmp_path: Path, document: dict[str, object], said: str
+) -> None:
+    with pytest.raises(ConfigError, match=said):
+        Limits.read(written(tmp_path, document))
+
+
+@pytest.mark.parametrize(
+    ("limits", "said"),
+    [
+        (Limits(rest=(0.0,)), "rest: expected 3 numbers"),
+        (Limits(low=1.0, high=0.0), "expected low below high"),
+        (Limits(first=(1.0, 2.0)), "want one number, or 3"),
+        (Limits(rest=(0.0, 0.0, 0.0)), "rest: expected null for the grippers"),
+    ],
+    ids=str,
+)
+def test_limits_that_do_not_fit_the_actions_are_an_error_before_the_first_one(limits: Limits, said: str) -> None:
+    with pytest.raises(ConfigError, match=said):
+        Guard(Contract(action=spec_of(delta=False, arms=None)), limits=limits, hz=HZ)
+
+
+# Limits from a dataset accept its demonstrations.
+
+
+def recorded(root: Path, spec: ActionSpec | None, episodes: list[np.ndarray]) -> Path:
+    """Write a dataset of episodes, (T, D) each."""
+    dataset = Dataset(root, HZ, durable=False)
+    for actions in episodes:
+        episode = dataset.begin("stack", spec)
+        for tick, action in enumerate(actions):
+            obs = Obs(state={"joints": np.zeros(1, np.float32)})
+            episode.add(obs, action, tick / HZ, tick, False)
+        dataset.save(episode.finish())
+    return root
+
+
+def demonstrations(spec: ActionSpec, seed: int) -> list[np.ndarray]:
+    """Return smooth motions from rest with grippers that open and close, (T, D) each."""
+    random = np.random.default_rng(seed)
+    episodes = []
+    for _ in range(3):
+        time_s = np.arange(int(random.integers(300, 600))) / HZ
+        periods_s = random.uniform(2, 6, spec.dim or 1)
+        actions = np.sin(np.pi * time_s[:, None] / periods_s) ** 3 * random.uniform(0.2, 1.0, spec.dim or 1)
+        deltas = spec.delta_columns(spec.dim or 1)
+        moved = np.diff(actions, axis=0, prepend=0.0)
+        actions[:, deltas] = moved[:, deltas]
+        episodes.append(actions.astype(np.float32))
+    return episodes
+
+
+def require_accepted(guard: Guard, actions: np.ndarray) -> None:
+    """Raise `InvalidAction` unless a guard accepts all rows of an episode, (T, D)."""
+    last = None
+    for action in actions:
+        last = guard(action, last)
+
+
+@pytest.mark.parametrize(("delta", "arms"), KINDS)
+@pytest.mark.parametrize("seed", range(3))
+def test_limits_of_a_dataset_accept_its_demonstrations_and_no_ten_times_faster_ones(
+    tmp_path: Path, delta: bool, arms: int | None, seed: int
+) -> None:
+    spec = spec_of(delta, arms)
+    episodes = demonstrations(spec, seed)
+    folder = recorded(tmp_path / "demos", spec, episodes)
+    for soft_start_s in (0.0, 120.0):
+        guard = Guard(Contract(action=spec), limits=folder, hz=HZ, soft_start_s=soft_start_s)
+        for actions in episodes:
+            require_accepted(guard, actions)
+    faster = episodes[0][::10] * (10 if delta else 1)
+    with pytest.raises(InvalidAction):
+        require_accepted(guard, faster)
+
+
+def test_a_dataset_without_a_contract_has_actions_of_the_policys_kind(tmp_path: Path) -> None:
+    spec = ActionSpec(dim=2, delta=True)
+    episodes = demonstrations(spec, 0)
+    folder = recorded(tmp_path / "demos", spec, episodes)
+    info = json.loads((folder / "meta/info.json").read_text())
+    del info["vlagents_ray"]
+    (folder / "meta/info.json").write_text(json.dumps(info))
+    speeds = np.abs(np.concatenate(episodes)).max(0) * HZ
+    assert np.asarray(Limits.read(folder, spec).velocity) == pytest.approx(2 * speeds, rel=0.05)
+    guard = Guard(Contract(action=spec), limits=folder, hz=HZ)
+    guard(episodes[0][1], guard(episodes[0][0]))
+    with pytest.raises(ConfigError, match="low, high for relative actions"):
+        Guard(Contract(action=spec), limits=Limits.read(folder), hz=HZ)
+
+
+@pytest.mark.parametrize("delta", [False, True])
+def test_a_dataset_with_one_number_an_action_has_limits(tmp_path: Path, delta: bool) -> None:
+    spec = ActionSpec(dim=1, delta=delta)
+    episodes = demonstrations(spec, 0)
+    guard = Guard(Contract(action=spec), limits=recorded(tmp_path / "demos", spec, episodes), hz=HZ)
+    last = None
+    for action in episodes[0]:
+        last = guard(action, last)
+
+
+def test_constant_deltas_from_the_first_frame_on_have_limits_that_accept_them(tmp_path: Path) -> None:
+    spec = ActionSpec(dim=2, space="ee_position", delta=True)
+    rows = np.tile(np.array([0.01, 0.005], np.float32), (600, 1))
+    guard = Guard(Contract(action=spec), limits=recorded(tmp_path / "demos", spec, [rows]), hz=HZ)
+    last = None
+    for action in rows:
+        last = guard(action, last)
+    with pytest.raises(InvalidAction):
+        guard(np.array([1.0, 0.0], np.float32), last)

@@ -1,0 +1,206 @@
+"""The contract of `stop` for every arm: at rest where it is, with its grasp, whatever sensor is broken."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable
+from contextlib import closing
+from typing import Any
+
+import numpy as np
+import pytest
+from arm_models import simulated_arm
+
+from vlagents_ray import ActionSpec, Contract
+from vlagents_ray.robot.lerobot_robot import LeRobotRobot, OneAtATime
+from vlagents_ray.robot.simulated import SimulatedRobot
+
+MOTORS = ("shoulder", "elbow", "gripper")
+POSE = np.array([12.0, -3.0, 31.0], np.float32)  # the fingers stand at an object, 31 % open
+GRASP = 2.0  # the gripper's goal
+
+
+class Bus:
+    """The bus of LeRobot's motors, which two threads must not use at once."""
+
+    def __init__(self) -> None:
+        self.broken = False
+        self.goals: dict[str, float] = {}
+        self.inside = 0
+        self.shared = False  # two transfers at once
+        self.slow: Callable[[], object] = lambda: None
+
+    def sync_read(self, name: str) -> dict[str, float]:
+        return self._transfer(lambda: self._read(name))
+
+    def sync_write(self, name: str, values: dict[str, float]) -> None:
+        assert name == "Goal_Position"
+        self._transfer(lambda: self.goals.update(values))
+
+    def _read(self, name: str) -> dict[str, float]:
+        assert name == "Present_Position"
+        if self.broken:
+            raise ConnectionError("There is no status packet!")
+        return dict(zip(MOTORS, POSE.tolist(), strict=True))
+
+    def _transfer(self, work: Callable[[], Any]) -> Any:
+        self.inside += 1
+        self.shared |= self.inside > 1
+        self.slow()
+        try:
+            return work()
+        finally:
+            self.inside -= 1
+
+
+class FakeFollower:
+    """An arm as LeRobot's `SOFollower`: the bus is read first, then each camera."""
+
+    observation_features: dict[str, Any] = {f"{motor}.pos": float for motor in MOTORS} | {"wrist": (4, 4, 3)}
+    action_features: dict[str, Any] = {f"{motor}.pos": float for motor in MOTORS}  # noqa: RUF012
+
+    def __init__(self, *, has_bus: bool = True, max_relative_target: float | None = None) -> None:
+        self.wire = Bus()
+        if has_bus:
+            self.bus: Any = self.wire
+        self.max_relative_target = max_relative_target
+        self.camera_broken = False
+        self.camera: Callable[[], object] = lambda: None
+
+    def get_observation(self) -> dict[str, Any]:
+        bus = getattr(self, "bus", self.wire)
+        positions = {f"{motor}.pos": value for motor, value in bus.sync_read("Present_Position").items()}
+        self.camera()
+        if self.camera_broken:
+            raise TimeoutError("Timed out waiting for frame from camera wrist after 200 ms.")
+        return positions | {"wrist": np.zeros((4, 4, 3), np.uint8)}
+
+    def send_action(self, action: dict[str, float]) -> None:
+        bus = getattr(self, "bus", self.wire)
+        if self.max_relative_target is not None:
+            bus.sync_read("Present_Position")
+        bus.sync_write("Goal_Position", {name.removesuffix(".pos"): goal for name, goal in action.items()})
+
+
+def robot_of(follower: FakeFollower) -> LeRobotRobot:
+    """Return the adapter of a fake arm, without LeRobot's registry."""
+    robot = LeRobotRobot.__new__(LeRobotRobot)
+    robot._robot, robot._keys, robot._unit = follower, list(follower.action_features), "deg"
+    robot._lock_buses()
+    return robot
+
+
+FOLLOWERS: dict[str, Callable[[], FakeFollower]] = {
+    "bus": FakeFollower,
+    "bus, clipped goals": lambda: FakeFollower(max_relative_target=5.0),
+    "no bus": lambda: FakeFollower(has_bus=False),
+}
+
+
+@pytest.mark.parametrize("broken", ["nothing", "camera", "encoders", "camera and encoders"])
+@pytest.mark.parametrize("kind", FOLLOWERS)
+def test_a_lerobot_arm_stops_where_it_is_and_keeps_its_grasp(kind: str, broken: str) -> None:
+    follower = FOLLOWERS[kind]()
+    robot = robot_of(follower)
+    robot.observe()
+    robot.apply(np.array([20.0, 5.0, GRASP], np.float32))
+    follower.camera_broken = "camera" in broken
+    follower.wire.broken = "encoders" in broken
+    for _ in range(3):  # it may be called repeatedly
+        robot.stop()
+        assert follower.wire.goals == {"shoulder": 12.0, "elbow": -3.0, "gripper": GRASP}
+
+
+@pytest.mark.parametrize("broken", ["camera", "encoders", "camera and encoders"])
+@pytest.mark.parametrize("kind", FOLLOWERS)
+def test_a_lerobot_arm_that_was_neither_seen_nor_commanded_stays_as_it_is(kind: str, broken: str) -> None:
+    follower = FOLLOWERS[kind]()
+    robot = robot_of(follower)
+    follower.camera_broken = "camera" in broken
+    follower.wire.broken = "encoders" in broken
+    robot.stop()
+    assert set(follower.wire.goals.values()) <= set(POSE.tolist())
+
+
+def test_a_stop_from_another_thread_does_not_share_the_bus_with_the_loop() -> None:
+    follower = FakeFollower()
+    robot = robot_of(follower)
+    robot.observe()
+    over = threading.Event()
+    follower.wire.slow = lambda: time.sleep(0)  # another thread may run here
+
+    def stop() -> None:
+        while not over.is_set():
+            robot.stop()
+
+    thread = threading.Thread(target=stop)
+    thread.start()
+    for _ in range(300):
+        robot.observe()
+        robot.apply(POSE)
+    over.set()
+    thread.join()
+    assert not follower.wire.shared
+
+
+def test_a_stop_does_not_wait_for_a_camera_that_hangs() -> None:
+    follower = FakeFollower()
+    robot = robot_of(follower)
+    robot.observe()
+    robot.apply(np.array([20.0, 5.0, GRASP], np.float32))
+    hangs, released = threading.Event(), threading.Event()
+    follower.camera = lambda: (hangs.set(), released.wait())
+    thread = threading.Thread(target=robot.observe)
+    thread.start()
+    assert hangs.wait(30)
+    robot.stop()
+    assert follower.wire.goals["shoulder"] == 12.0
+    released.set()
+    thread.join()
+
+
+def test_a_locked_bus_is_still_a_bus() -> None:
+    bus = OneAtATime(Bus())
+    assert bus.goals == {}
+    bus.sync_write("Goal_Position", {"elbow": 1.0})
+    assert bus.goals == {"elbow": 1.0}
+    assert not hasattr(bus, "unknown")
+
+
+@pytest.mark.parametrize("delta", [False, True])
+@pytest.mark.parametrize("arms", [None, ("left", "right")])
+def test_a_simulated_robot_stops_where_it_is_and_keeps_its_grasp(delta: bool, arms: tuple[str, ...] | None) -> None:
+    dim = 3 * len(arms or ("",))
+    spec = ActionSpec(dim=dim, delta=delta, gripper_open=1.0, gripper_closed=0.0, arms=arms)
+    robot = SimulatedRobot(Contract(action=spec))
+    robot.apply(np.full(dim, 1.0, np.float32))
+    robot.observe()
+    for _ in range(3):
+        robot.stop()
+    before = robot.observe().state["joints"]
+    for _ in range(50):
+        after = robot.observe().state["joints"]
+    grippers = spec.gripper_columns(dim)
+    assert np.allclose(np.delete(after, grippers), np.delete(before, grippers))
+    assert np.allclose(after[grippers], 1.0), "as commanded before the stop"
+
+
+@pytest.mark.sim
+@pytest.mark.parametrize("delta", [False, True])
+@pytest.mark.parametrize("name", ["franka", "aloha"])
+def test_an_arm_in_mujoco_stops_where_it_is_and_keeps_its_grasp(name: str, delta: bool) -> None:
+    with closing(simulated_arm(name, cameras=(), delta=delta)) as arm:
+        spec = arm.contract.action
+        dim = spec.dim or 0
+        grippers = spec.gripper_columns(dim)
+        action = np.full(dim, 0.5, np.float32) if delta else np.array(arm._goal, np.float32) + np.float32(0.5)
+        action[grippers] = 0.4
+        arm.apply(action)
+        arm.clock.sleep(0.1)
+        arm.stop()
+        stopped = arm.joints()
+        arm.clock.sleep(2.0)
+        arm.stop()
+        assert np.abs(arm.joints() - stopped).max() < 0.2, "far from the goal"
+        assert np.allclose(np.array(arm._goal)[grippers], 0.4)
