@@ -12,6 +12,7 @@ from hypothesis import strategies as st
 
 from vlagents_ray.errors import InvalidWeights, NotTrainable, UnchangedWeights
 from vlagents_ray.interface import Act, Agent, Obs
+from vlagents_ray.weights import trainable
 from vlagents_ray.weights.trainable import (
     accepted,
     completed,
@@ -176,6 +177,25 @@ def test_what_does_not_fit_is_refused(pushed: dict[str, Any], says: str) -> None
     with np.errstate(over="ignore"), pytest.raises(InvalidWeights, match=says) as refused:
         fitted(HELD, pushed)
     assert "nothing was changed" in str(refused.value)
+
+
+@pytest.mark.torch
+@pytest.mark.parametrize("dtype", ["float32", "float16", "bfloat16", "float64"])
+@pytest.mark.parametrize("value", [float("nan"), float("inf"), -float("inf")])
+@pytest.mark.parametrize("place", [0, 1234, -1])
+def test_one_number_that_is_not_finite_is_found_among_many_tensors(dtype: str, value: float, place: int) -> None:
+    torch = pytest.importorskip("torch")
+    kind = getattr(torch, dtype)
+    held = {str(i): torch.zeros(3000, dtype=kind) for i in range(4)}
+    held |= {"empty": torch.zeros(0), "count": torch.zeros(2, dtype=torch.int64), "other": torch.zeros(5)}
+    pushed = {name: one + 1 for name, one in held.items()}
+    pushed["3"][:] = torch.finfo(kind).max  # whose norms in other senses are infinite
+    assert set(trainable.accepted(held, pushed)) == set(held)
+    pushed["2"][place] = value
+    with pytest.raises(
+        InvalidWeights, match=r"nothing was changed: '2': got NaN or infinite values, want finite ones$"
+    ):
+        trainable.accepted(held, pushed)
 
 
 def test_infinite_values_fit_where_the_policy_has_them() -> None:

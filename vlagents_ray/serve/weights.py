@@ -18,7 +18,7 @@ from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass
-from typing import Any, Literal, Protocol, get_args
+from typing import Any, Literal, Protocol, TypeVar, get_args
 from weakref import WeakValueDictionary, ref
 
 import numpy as np
@@ -30,6 +30,7 @@ from vlagents_ray.errors import (
     Overloaded,
     PolicyUnavailable,
     UnknownSession,
+    VLAgentsError,
     WeightsNotStaged,
 )
 from vlagents_ray.interface import POLICY, Agent
@@ -42,6 +43,8 @@ from vlagents_ray.weights.shared_values import SharedValues, gpu_of, opened, rea
 from vlagents_ray.weights.trainable import beside_acts
 
 logger = logging.getLogger(__name__)
+
+T = TypeVar("T")
 
 STAGED_S = 60.0  # time for which a staged version waits for its commit, s
 
@@ -124,6 +127,7 @@ class ModelWeights:
         self.gpus: tuple[str, ...] = ()  # see `NewestVersion`
         self._agent, self._busy = agent, busy
         self._device: Any = "cpu"  # the GPU of its values, if they are on one
+        self._live_values: Mapping[str, Any] = {}  # the agent's, if another version takes their place in memory
         self._lock = threading.Lock()
         try:
             values: dict[str, Any] | None = agent.parameters()
@@ -139,6 +143,8 @@ class ModelWeights:
             own, copied = type(policy).load_parameters is not Agent.load_parameters, trainable.is_copied(values or {})
             self._in_place, self._swaps = own or copied, copied and not own and trainable.are_apart(values or {})
             first = WeightsVersion(0, trainable.fingerprint(values or {}), None if self._in_place else values)
+            if self._in_place:
+                self._live_values = values or {}
             self.gpus = readable_gpus(gpu_of(values or {}))
             on_gpu = (value.device for value in (values or {}).values() if getattr(value, "is_cuda", False))
             self._device = next(on_gpu, "cpu")
@@ -149,19 +155,15 @@ class ModelWeights:
         self._alive = WeakValueDictionary({0: first})
         self._asleep = False
         self._moved: list[tuple[Any, Any]] = []  # memory of the host with the values of the GPU, while it sleeps
-        self._counted = 1  # versions alive after the last commit or reset
-        self._switches = 0  # how often another version became the agent's
+        # Is increased when another version begins to become the agent's, and when it has: odd in between.
+        self._switches = 0
 
     def begin(self, session: FollowingSession, *, follows: bool) -> WeightsVersion:
         """Choose the newest or the pinned version for the session's next episode, and return it."""
         with self._lock:
             session.follows = follows
-            session.weights = version = self.newest if follows else self.pinned
-            alive = len(self._alive)
-            freed, self._counted = alive < self._counted, alive
-        if freed and self._in_place:
-            empty_cache()
-        return version
+            session.weights = self.newest if follows else self.pinned
+            return session.weights
 
     def find(self, number: int, digest: str) -> WeightsVersion:
         """Return the version of a session from another replica; raise `UnknownSession` if it is not held here."""
@@ -171,9 +173,13 @@ class ModelWeights:
         return version
 
     def use(self, version: WeightsVersion) -> None:
-        """Load a version into the agent. Called with `busy` held, on the policy's thread."""
+        """Load a version into the agent. Called with `busy` held, on the policy's thread.
+
+        The memory of freed versions stays torch's, for the next push: its return would wait for the GPU.
+        """
         if version is self._live:
             return
+        self._switches += 1
         outgoing, self._live = None if self._live is None else ref(self._live), None
         live = None if outgoing is None else outgoing()  # None if nothing else refers to it
         kept = live if self._in_place and live is not None and live.values is None else None
@@ -187,11 +193,11 @@ class ModelWeights:
                 if version.values is not None:  # otherwise the agent still has its own values
                     self._agent.load_parameters(version.values)
         self._live = version
-        self._switches += 1
         if self._in_place:
             version.values, version.on_host = None, False
-            if kept is None:
-                empty_cache()
+            if not self._swaps:  # otherwise the parameters are the same objects
+                self._live_values = self._agent.parameters()
+        self._switches += 1
 
     def read_header(self, header: bytes, options: PushOptions) -> dict[str, ValueSpec]:
         """Check the header of a push, and return the types and shapes of the announced values.
@@ -278,10 +284,12 @@ class ModelWeights:
         """Return a version of pushed values, which have been checked; missing names have the values of the newest."""
         with self._uncaptured(), opened(pushed) if isinstance(pushed, SharedValues) else nullcontext(pushed) as named:
             new = trainable.accepted(self._held(newest), named, partial=options.partial)
-            with self._busy if self._in_place else nullcontext():  # another version could become the agent's
-                held = self._agent.parameters() if newest.values is None else newest.values
-                values = trainable.completed(held, new, allow_same=options.allow_same, in_place=self._in_place)
-            del held
+
+            def completed(held: Mapping[str, Any]) -> dict[str, Any]:
+                return trainable.completed(held, new, allow_same=options.allow_same, in_place=self._in_place)
+
+            reads_none = options.allow_same and not options.partial
+            values = completed(self._held(newest)) if reads_none else self._read(newest, completed)
             return WeightsVersion(number, trainable.fingerprint(values), values)
 
     def admit(self, version: WeightsVersion) -> None:
@@ -315,7 +323,6 @@ class ModelWeights:
                     f"weights: version {number} is not staged here; push it again, and commit within {STAGED_S:g} s"
                 )
             self.newest = self._alive[number] = self._staged
-            self._counted = len(self._alive)
             if options.pin:
                 self.pinned = self.newest
             self._forget_staged()
@@ -338,9 +345,7 @@ class ModelWeights:
     def portable_values(self, version: WeightsVersion) -> dict[str, Any]:
         """Return the values of a version as numpy arrays, for another process."""
         with self._uncaptured():
-            with self._busy if self._in_place else nullcontext():  # another version could become the agent's
-                values = self._agent.parameters() if version.values is None else version.values
-                values = trainable.mapped(trainable.own_copy, values) if self._in_place else values
+            values = self._read(version, self._unchanging)
             return {name: trainable.portable(value) for name, value in values.items()}
 
     def sleep(self, *, offload: bool) -> None:
@@ -397,12 +402,39 @@ class ModelWeights:
             self._timer.cancel()
             self._timer = None
 
-    def _held(self, version: WeightsVersion) -> dict[str, Any]:
-        """Return references to values with the types, shapes and devices of the version's."""
-        if (values := version.values) is not None and not version.on_host:
-            return values
+    def _held(self, version: WeightsVersion) -> Mapping[str, Any]:
+        """Return references to values with the types, shapes and devices of the version's, without waiting for acts."""
+        values = version.values
+        return self._live_values if values is None or version.on_host else values
+
+    def _read(self, version: WeightsVersion, read: Callable[[Mapping[str, Any]], T]) -> T:
+        """Return the result of a function of a version's values, which may be the agent's.
+
+        It does not wait for acts. If another version becomes the agent's meanwhile, in the same memory, the function is
+        called once more, between two acts.
+        """
+
+        def result() -> T:
+            values = version.values
+            return read(self._live_values if values is None else values)
+
+        if not self._in_place:
+            return result()
+        switches = self._switches
+        if switches % 2 == 0:
+            try:
+                found = result()
+            except VLAgentsError:
+                if self._switches == switches:
+                    raise
+            else:
+                if self._switches == switches:
+                    return found
         with self._busy:
-            return self._agent.parameters()
+            return result()
+
+    def _unchanging(self, values: Mapping[str, Any]) -> Mapping[str, Any]:
+        return trainable.mapped(trainable.own_copy, values) if self._in_place else values
 
     def _move_to_host(self, used: set[WeightsVersion | None]) -> None:
         """Move the pinned and the newest version out of the GPU's memory, unless it is the agent's or one of `used`."""

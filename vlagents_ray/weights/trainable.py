@@ -363,7 +363,9 @@ def accepted(held: Mapping[str, Any], pushed: Mapping[str, Any], *, partial: boo
     places = {name: memory_of(name, value) for name, value in held.items()}
     last = {places[name]: name for name in pushed}
     new = {place: converted(pushed[name], held[name]) for place, name in last.items()}
-    finite = {name: _is_finite(new[place]) for place, name in last.items()}
+    named = {name: new[place] for place, name in last.items()}
+    finite = _all_finite_tensors(named)
+    finite |= {name: _is_finite(value) for name, value in named.items() if not finite.get(name)}
     finite |= _fetched({name: one for name, one in finite.items() if _is_tensor(one)})
     # Constants of a module, such as masks of attention, may be infinite: a learner pushes them unchanged.
     wrong = [name for name, is_so in finite.items() if not is_so and not _is_equal(new[places[name]], held[name])]
@@ -472,6 +474,25 @@ def _is_finite(value: Any) -> Any:
     if value.is_complex():
         value = sys.modules["torch"].view_as_real(value)
     return sys.modules["torch"].stack(value.aminmax()).isfinite().all()  # which needs no memory, as above
+
+
+def _all_finite_tensors(named: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the names of torch tensors of real numbers that are surely finite, each with True.
+
+    The largest absolute values of all tensors of a device and type are computed together: several operations for each
+    of hundreds of tensors would share the GPU, and Python's lock, with acts.
+    """
+    groups: dict[Any, list[str]] = {}
+    for name, value in named.items():
+        if _is_tensor(value) and value.is_floating_point() and value.numel():
+            groups.setdefault((value.device, value.dtype), []).append(name)
+    finite: dict[str, Any] = {}
+    for names in groups.values():
+        torch = sys.modules["torch"]
+        largest = torch._foreach_norm([named[name].detach() for name in names], float("inf"))
+        are_finite = on_host(torch.stack(largest).isfinite()).tolist()
+        finite |= {name: True for name, is_so in zip(names, are_finite, strict=True) if is_so}
+    return finite
 
 
 def _is_equal(new: Any, held: Any) -> bool:
