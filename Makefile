@@ -17,8 +17,8 @@
 #   make gpu [DRY=1] [GPU_PYTHON=python3] [STEPS="facts,tests"]     all that needs a GPU, in ten minutes, into build/gpu
 #   make gpu-pack                                                   what `make gpu` needs where there is no network
 #
-# Torch comes from wherever pip looks (its settings, PIP_INDEX_URL, PIP_FIND_LINKS). TORCH_INDEX_URL names
-# another index for torch alone: PyTorch's own install page gives the one with CPU-only wheels.
+# Torch comes from wherever pip looks (its settings, PIP_INDEX_URL, PIP_FIND_LINKS). If that is a CUDA build and the machine
+# shows no NVIDIA GPU, uv installs the CPU build from PyTorch's own index. TORCH_INDEX_URL names another index for torch.
 
 SHELL := /bin/bash
 .SHELLFLAGS := -eu -o pipefail -c
@@ -33,7 +33,8 @@ TORCH_CUDA ?=
 PYTHON ?= $(shell for python in python3.11 python3; do \
 	$$python -c 'import sys; sys.exit(sys.version_info[:2] != (3, 11))' 2>/dev/null && command -v $$python && break; done)
 
-NO_PYTHON := setup: found no Python 3.11; install it, or name one: make setup PYTHON=/path/to/python3.11
+GOAL := $(or $(MAKECMDGOALS),setup)
+NO_PYTHON := $(GOAL): found no Python 3.11; install it, or name one: make $(GOAL) PYTHON=/path/to/python3.11
 
 # Tests start hundreds of interpreters, and pytest rewrites every test file: without compiled files that is half of the time.
 unexport PYTHONDONTWRITEBYTECODE
@@ -217,7 +218,7 @@ $(STAMP): pyproject.toml $(CONSTRAINTS)
 
 $(VENV)/.demo: pyproject.toml $(CONSTRAINTS)
 	@echo '== installing what the demo needs into $(VENV)'
-	$(PIP) install --quiet --constraint $(CONSTRAINTS) --editable '.[sim]'
+	$(PIP) install --constraint $(CONSTRAINTS) --editable '.[sim]'
 	@touch $@
 
 # What a server installs; as old as its last change, whatever else changes in pyproject.toml.
@@ -245,16 +246,22 @@ $(VENV)-docs/.installed: pyproject.toml
 $(CONSTRAINTS): pyproject.toml | $(BIN)/python
 	@echo '== installing torch into $(VENV)'
 	@plan=$$($(PIP) install --quiet --dry-run --report - $(TORCH_FROM) '$(TORCH)'); \
-	if grep -qiE '"name": *"(nvidia|cuda)-' <<<"$$plan" && [ -z '$(TORCH_CUDA)' ] \
-	    && ! [ -e /dev/nvidia0 ] && ! nvidia-smi >/dev/null 2>&1; then \
-	  { echo 'setup: stopped before downloading several GB: pip would take the CUDA build of $(TORCH),'; \
-	    echo '  but this machine shows no NVIDIA GPU (no /dev/nvidia0, no working nvidia-smi). Choose one:'; \
-	    echo '    make setup TORCH_INDEX_URL=URL   an index with CPU-only wheels, as PyTorch'"'"'s install page gives'; \
-	    echo '    PIP_FIND_LINKS=FOLDER make setup a folder that holds the CPU-only wheel'; \
-	    echo '    make setup TORCH_CUDA=1          the CUDA build after all; it runs on a CPU, too'; } >&2; \
-	  exit 1; \
+	if ! grep -qiE '"name": *"(nvidia|cuda)-' <<<"$$plan" || [ -n '$(TORCH_CUDA)' ] \
+	    || [ -e /dev/nvidia0 ] || nvidia-smi >/dev/null 2>&1; then \
+	  $(PIP) install $(TORCH_FROM) '$(TORCH)'; \
+	else \
+	  echo '== without an NVIDIA GPU: the CPU build from PyTorch'"'"'s own index, several GB smaller'; \
+	  $(PIP) install --quiet uv && \
+	  $(BIN)/uv pip install --python $(BIN)/python --torch-backend cpu '$(TORCH)' || { \
+	    echo '$(GOAL): stopped before downloading several GB: pip would take the CUDA build of $(TORCH), but this'; \
+	    echo '  machine shows no NVIDIA GPU (no /dev/nvidia0, no working nvidia-smi), and the CPU build cannot be'; \
+	    echo '  installed from PyTorch'"'"'s own index, as the lines above say. Choose one:'; \
+	    echo '    make $(GOAL) TORCH_INDEX_URL=URL   another index with CPU-only wheels'; \
+	    echo '    PIP_FIND_LINKS=FOLDER make $(GOAL) a folder that holds the CPU-only wheel'; \
+	    echo '    make $(GOAL) TORCH_CUDA=1          the CUDA build after all; it also runs on a CPU'; \
+	    exit 1; \
+	  } >&2; \
 	fi
-	$(PIP) install --quiet $(TORCH_FROM) '$(TORCH)'
 	@$(PIP) freeze | grep '^torch==' >$@
 	@sed -n 's/.*"ray\[serve\]\(==[0-9.]*\)".*/ray\1/p' pyproject.toml >>$@
 	@cat $@
