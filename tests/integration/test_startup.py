@@ -91,7 +91,8 @@ def test_a_signal_to_every_process_of_a_server_ends_it_in_seconds(whole: signal.
         assert "has not ended" not in process.stdout.read()
 
 
-def test_health_is_503_while_the_policy_loads_and_clients_wait_for_it(tmp_path: Path) -> None:
+def test_the_port_is_closed_while_the_policy_loads_and_clients_wait_for_it(tmp_path: Path) -> None:
+    """openpi's client, for one, waits only while its connection is refused."""
     gate, port = tmp_path / "gate", free_port()
     url = f"http://127.0.0.1:{port}"
     answers: list[Any] = []
@@ -101,8 +102,10 @@ def test_health_is_503_while_the_policy_loads_and_clients_wait_for_it(tmp_path: 
             answers.append(agent.reset(Obs(), "x"))
 
     def watch() -> None:
-        wait_for(lambda: health(url) == 503)
-        answers.append(503)
+        wait_for(Path(f"{gate}.loading").exists)
+        with pytest.raises(ConnectionRefusedError):
+            socket.create_connection(("127.0.0.1", port), timeout=5)
+        answers.append("refused")
         thread.start()
         gate.touch()
 
@@ -112,7 +115,7 @@ def test_health_is_503_while_the_policy_loads_and_clients_wait_for_it(tmp_path: 
         watcher.join(120)
         thread.join(120)
         first, info = answers
-        assert first == 503
+        assert first == "refused"
         assert info["weights"].startswith("sampled-sha256:")  # of the file that a setting names
         assert health(url) == 200
 

@@ -140,12 +140,13 @@ class Hanging(Agent):
 
 
 class Gated(Agent):
-    """Loads when a file appears."""
+    """Loads when a file appears, and makes another one, GATE.loading, while it waits."""
 
     def __init__(self, gate: str) -> None:
         self.gate = gate
 
     def initialize(self) -> None:
+        Path(f"{self.gate}.loading").touch()
         while not Path(self.gate).exists():
             time.sleep(0.02)
 

@@ -35,6 +35,7 @@ from vlagents_ray.serve.launch.haproxy import (
     ROBOTS,
     _launcher,
     haproxy_binary,
+    open_port,
     wait_for_haproxy,
 )
 from vlagents_ray.serve.ports import free_port
@@ -105,6 +106,7 @@ def proxied(folder: Path, *servers: str, settings: str = "") -> Iterator[str]:
             "backend http-app\n" + settings + "".join(f"    server {one}\n" for one in servers)
         )
         config.write_text(text.replace("ADDRESS", address))
+        open_port(folder)
         command = [str(_launcher(folder, str(haproxy_binary()))), "-db", "-f", str(config)]
         with subprocess.Popen(command) as proxy:
             try:
@@ -123,6 +125,47 @@ def seconds(setting: str) -> float:
 REPLICA, FALLBACK = "SERVE_REPLICA_app-Policy-1 ADDRESS", "SERVE_PROXY_ACTOR-fallback ADDRESS backup"
 UPGRADE = {"connection": "upgrade", "upgrade": "websocket", "sec-websocket-key": "dGhlIHNhbXBsZSBub25jZQ=="}
 needs_haproxy = pytest.mark.skipif(haproxy_binary() is None, reason="HAProxy is not installed")
+
+
+SERVES_OWN = """\
+frontend prometheus
+    bind 127.0.0.1:9000
+frontend http_frontend
+    bind 127.0.0.1:8000
+backend http-app
+    server {server}
+listen outside
+    mode tcp
+    bind 192.0.2.7:8443 ssl
+    server inside 127.0.0.1:8000
+listen stats
+  bind 127.0.0.1:9001
+"""
+
+
+def binds(launcher: Path, config: Path, server: str) -> list[str]:
+    """The addresses at which HAProxy would listen with the settings that Serve writes for a server of the backend."""
+    config.write_text(SERVES_OWN.format(server=server))
+    subprocess.run([launcher, "-f", config], check=True)
+    return re.findall(r"^ *bind (\S+)", config.read_text(), re.MULTILINE)
+
+
+@pytest.mark.parametrize("begins_empty", [False, True])
+def test_clients_are_refused_until_the_first_replica_runs(begins_empty: bool, tmp_path: Path) -> None:
+    """openpi's client waits for a server whose port is closed, and ends at a handshake that is refused or hangs."""
+    launcher, config = _launcher(tmp_path, "/bin/true"), tmp_path / "haproxy.cfg"
+    own, public = ["127.0.0.1:9000", "127.0.0.1:9001"], ["127.0.0.1:8000", "192.0.2.7:8443"]
+    if begins_empty:
+        open_port(tmp_path)
+    assert set(binds(launcher, config, FALLBACK)) == {*own, *(public if begins_empty else [])}
+    assert set(binds(launcher, config, REPLICA)) == {*own, *public}
+    # When the last replica has ended, clients get an answer that says so.
+    assert set(binds(launcher, config, FALLBACK)) == {*own, *public}
+
+
+def test_a_cluster_whose_haproxy_serves_others_opens_its_port_at_once(tmp_path: Path) -> None:
+    launcher = _launcher(tmp_path, "/bin/true", alone=False)
+    assert "127.0.0.1:8000" in binds(launcher, tmp_path / "haproxy.cfg", FALLBACK)
 
 
 @needs_haproxy

@@ -368,6 +368,13 @@ class ServerArgs(_DeploymentModel):
     environment: EnvironmentArgs = Field(default=EnvironmentArgs(), description="the Python that the policy runs in")
     dialects: DialectArgs = Field(default=DialectArgs(), description="other systems' clients that may connect")
 
+    @property
+    def initial_replicas(self) -> int:
+        """The number of replicas that start without a request."""
+        if self.autoscaling is None:
+            return self.replicas or 1
+        return max(self.autoscaling.min_replicas, self.autoscaling.initial_replicas or 0)
+
     def code(self) -> tuple[GitState | None, Program]:
         """Return the git state of the policy's code, and the digests of its files and of those of its wrappers."""
         policy = names("policies").get(self.policy, self.policy)

@@ -33,6 +33,7 @@ _CHECK_INTERVAL = "RAY_SERVE_HAPROXY_HEALTH_CHECK_INTER"
 _CHECK_FAILURES = "RAY_SERVE_HAPROXY_HEALTH_CHECK_FALL"
 _WAIT_MS = 1800  # maximum time of a reply to `/healthz`, and of any reply while no replica runs
 _RETRY_AFTER_S = 1
+_OPEN = "open"  # file name, in the same folder: the port has been open, and stays open
 _REFUSAL = "no-replica.http"  # file name, in the folder of the script that starts HAProxy
 _CIPHERS = "ECDHE+AESGCM:ECDHE+CHACHA20"  # for TLS 1.2: with forward secrecy, without CBC
 _REPLICA_PORTS = 200  # size of the block of ports at which the replicas of one server listen
@@ -204,6 +205,9 @@ def _launcher(folder: Path, binary: str, *, alone: bool = True, limit_addresses:
     No WebSocket is compressed, since a replica would inflate a message before any limit applies. A handshake has no
     body, as a replica would never answer it.
 
+    If the server is `alone`, its port is closed until the first replica runs: clients of other systems retry a refused
+    connection, but end at a refused handshake. `open_port` opens it at once.
+
     If an application has no replica, Serve would hold its requests until there is one. Here they are held briefly, so
     that an application scaled to zero starts a replica, and then get 503; WebSockets wait.
 
@@ -244,17 +248,33 @@ def _launcher(folder: Path, binary: str, *, alone: bool = True, limit_addresses:
         rf"s/^    server .* backup$/    {wait} if !replica_up !{{ hdr(upgrade) -m found }}\n& non-stick/",
         r"s/^backend .*$/&\n    stick-table type string len 128 size 100k expire 1h\n    stick on hdr(x-session-id)/",
     )
+    is_open = shlex.quote(str(folder / _OPEN))
+    close_port = r"/^(frontend http_frontend|listen outside)$/,/^ *bind /s/^ *bind /    # &/"
+    opening = (
+        f"        if [ ! -e {is_open} ]; then\n"
+        f"""            if grep -q '^    server SERVE_REPLICA' "$word"; then : >{is_open}\n"""
+        f"""            else sed -i -E -e '{close_port}' "$word"; fi\n"""
+        "        fi\n"
+    )
     file = folder / "haproxy"
     file.write_text(
         "#!/bin/sh\n"
         "for word; do\n"
-        f"""    [ "$before" = -f ] && sed -i -E {" ".join(f"-e '{one}'" for one in changes)} "$word"\n"""
+        """    if [ "$before" = -f ]; then\n"""
+        f"""        sed -i -E {" ".join(f"-e '{change}'" for change in changes)} "$word"\n"""
+        f"{opening if alone else ''}"
+        "    fi\n"
         "    before=$word\n"
         "done\n"
         f'exec {shlex.quote(binary)} "$@"\n'
     )
     file.chmod(0o700)
     return file
+
+
+def open_port(folder: Path) -> None:
+    """Open the port of a server without replicas from the start, such as one whose applications begin with none."""
+    (folder / _OPEN).touch()
 
 
 def wait_for_haproxy(serve: Any, apps: Mapping[str, str], stats_port: int, deadline: float) -> None:

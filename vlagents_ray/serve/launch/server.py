@@ -29,7 +29,14 @@ from vlagents_ray.ray_tools.reaper import MARK
 from vlagents_ray.serve.access.api_keys import require_access, warn_of_plain_http
 from vlagents_ray.serve.config.deployment import AccessArgs, ServerArgs
 from vlagents_ray.serve.launch import haproxy
-from vlagents_ray.serve.launch.deployment_file import Deployment, our_apps, with_gateways_at, with_replicas_on
+from vlagents_ray.serve.launch.deployment_file import (
+    IMPORT_PATH,
+    Application,
+    Deployment,
+    our_apps,
+    with_gateways_at,
+    with_replicas_on,
+)
 from vlagents_ray.serve.ports import EVERYWHERE, HOST, LOOPBACK, free_port, is_free, keep
 
 log = logging.getLogger(__name__)
@@ -142,7 +149,8 @@ def running_server(
     with contextlib.ExitStack() as stack:
         ingress = ingress or not own or len(our_apps(config)) < len(config.applications)
         public = port or free_port(host)
-        http = stack.enter_context(_ray(address, host, public, tls, num_cpus, ingress))
+        begins_empty = not all(map(_begins_with_replicas, config.applications))
+        http = stack.enter_context(_ray(address, host, public, tls, num_cpus, ingress, begins_empty))
         location = "Disabled" if not ingress else "HeadOnly" if address is None else "EveryNode"
         client, proxies = private.start_serve(http, location)
         if running := sorted(serve.status().applications):
@@ -232,12 +240,14 @@ def _missing_gpus(config: Deployment, here: float | None = None) -> str | None:
     )
 
 
+def _begins_with_replicas(app: Application) -> bool:
+    """Return whether an application gets a replica without a request; that of another package may not."""
+    return app.import_path == IMPORT_PATH and ServerArgs(**app.args).initial_replicas > 0
+
+
 def _gpus(args: ServerArgs) -> float:
     """Return the number of GPUs that the initial replicas need together."""
-    replicas = args.replicas or 1
-    if args.autoscaling is not None:
-        replicas = max(args.autoscaling.min_replicas, args.autoscaling.initial_replicas or 0)
-    return replicas * args.resources.num_gpus
+    return args.initial_replicas * args.resources.num_gpus
 
 
 def _check_access(config: Deployment, host: str, insecure: bool, tls: haproxy.Tls | None) -> None:
@@ -257,11 +267,17 @@ def _check_access(config: Deployment, host: str, insecure: bool, tls: haproxy.Tl
 
 @contextlib.contextmanager
 def _ray(
-    address: str | None, host: str, port: int, tls: haproxy.Tls | None, num_cpus: int | None, ingress: bool
+    address: str | None,
+    host: str,
+    port: int,
+    tls: haproxy.Tls | None,
+    num_cpus: int | None,
+    ingress: bool,
+    begins_empty: bool,
 ) -> Iterator[dict[str, Any]]:
     """Connect to a Ray or start one; yield Serve's options for its host, port and certificate."""
     if not ray.is_initialized() and address is None:
-        with own_ray(host, port, tls=tls, num_cpus=num_cpus, ingress=ingress) as listener:
+        with own_ray(host, port, tls=tls, num_cpus=num_cpus, ingress=ingress, begins_empty=begins_empty) as listener:
             if listener is not None:
                 yield {"host": LOOPBACK, "port": listener.inside}
             elif tls is None:
@@ -294,11 +310,18 @@ def spread_over_gpus(parts: Mapping[str, Deployment], *, kept: float = 0.0) -> d
 
 @contextlib.contextmanager
 def own_ray(
-    host: str, port: int, *, tls: haproxy.Tls | None = None, num_cpus: int | None = None, ingress: bool = True
+    host: str,
+    port: int,
+    *,
+    tls: haproxy.Tls | None = None,
+    num_cpus: int | None = None,
+    ingress: bool = True,
+    begins_empty: bool = False,
 ) -> Iterator[haproxy.PublicListener | None]:
     """Run a private Ray for the length of the context, which no other machine and no other user can reach.
 
-    The arguments are those of `running_server`; the server will listen at `host` and `port`.
+    The arguments are those of `running_server`; the server will listen at `host` and `port`, once it has a replica, or
+    from the start if an application `begins_empty`, as the first request then starts its replica.
 
     Yields:
         HAProxy's listener for clients; None if Serve listens itself.
@@ -329,6 +352,8 @@ def own_ray(
                 client_ca = None if tls is None or tls.client_ca is None else tls.client_ca.absolute()
                 listener = haproxy.PublicListener(host, port, free_port(), bundle, client_ca)
             settings = haproxy.ingress_environment(folder, binary, listener)
+            if begins_empty:
+                haproxy.open_port(folder)
             # HAProxy's files and admin socket are in the folder, regardless of the user's settings for clusters.
             ours |= {key: value for key, value in settings.items() if value.startswith(str(folder))}
             environment |= settings
