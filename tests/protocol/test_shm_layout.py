@@ -4,17 +4,21 @@ from __future__ import annotations
 
 import json
 import struct
+from collections.abc import Iterator
 from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import example, given
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
+from hypothesis.stateful import RuleBasedStateMachine, rule, run_state_machine_as_test
+from many import many
 
 from vlagents_ray.errors import InvalidInput, MalformedMessage, PolicyFailed
 from vlagents_ray.interface import Act, Obs
+from vlagents_ray.protocol import shm_layout
 from vlagents_ray.protocol.messages import Limits, Reply, Request
 from vlagents_ray.protocol.shm_layout import (
     ANSWER,
@@ -29,11 +33,12 @@ from vlagents_ray.protocol.shm_layout import (
 
 images = hnp.arrays(np.uint8, st.tuples(st.integers(1, 9), st.integers(1, 9), st.just(3)))
 states = hnp.arrays(np.float32, st.integers(0, 9), elements=st.floats(-1e6, 1e6, width=32))
+names = st.text(st.characters(codec="utf-8"), min_size=1, max_size=8).filter(str.isprintable)
 observations = st.builds(
     Obs,
-    cameras=st.dictionaries(st.text(max_size=8), images, max_size=3),
+    cameras=st.dictionaries(names, images, max_size=3),
     gripper=st.none() | st.floats(0, 1),
-    state=st.dictionaries(st.text(max_size=8), states, max_size=3),
+    state=st.dictionaries(names, states, max_size=3),
 )
 
 
@@ -224,3 +229,84 @@ def test_names_forge_no_line_in_a_log() -> None:
         written = ShmWriter().write([Request("act", Obs(), **names)])
         with pytest.raises(MalformedMessage):
             ShmReader(Limits()).read(memoryview(written.message), placed(written))
+
+
+class WritersAndReaders(RuleBasedStateMachine):
+    """One connection with four layouts at most, whose messages may be lost or refused on either side.
+
+    As in `ShmTransport`, a client whose message was not sent, or was refused before it was read, begins its layouts
+    again, while the server remembers those that it has read.
+    """
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.reconnect()
+
+    @rule()
+    def reconnect(self) -> None:
+        self.writer, self.reader = ShmWriter(), ShmReader(Limits(requests=8))
+
+    def written(self, sides: list[int], sessions: list[int]) -> tuple[list[Request], Written | None]:
+        requests = [seeing(side, f"s{session}") for side, session in zip(sides, sessions, strict=False)]
+        return requests, self.writer.write(requests)
+
+    @rule(sides=st.lists(st.integers(1, 3), min_size=1, max_size=3), sessions=st.lists(st.integers(0, 4), min_size=3))
+    def act(self, sides: list[int], sessions: list[int]) -> None:
+        requests, written = self.written(sides, sessions)
+        if written is None:
+            return  # sent as a frame
+        read = self.reader.read(memoryview(written.message), placed(written))
+        assert [request.session for request in read] == [request.session for request in requests]
+        for sent, got in zip(requests, read, strict=True):
+            np.testing.assert_array_equal(got.obs.cameras["front"], sent.obs.cameras["front"])
+        assert len(self.reader._known) <= 4
+
+    @rule(sides=st.lists(st.integers(1, 3), min_size=1, max_size=3), sessions=st.lists(st.integers(0, 4), min_size=3))
+    def send_in_vain(self, sides: list[int], sessions: list[int]) -> None:
+        """Over the rate, or not sent in time."""
+        self.written(sides, sessions)
+        self.writer = ShmWriter()
+
+    @rule(side=st.integers(1, 3), session=st.integers(0, 4))
+    def be_refused_behind_the_layout(self, side: int, session: int) -> None:
+        """The second act of a message is wrong: the layout of the first has been read, and the client starts over."""
+        _, written = self.written([side], [session])
+        if written is None:
+            return
+        count, rest = COUNT.pack(2), written.message[COUNT.size :]
+        wrong = ITEM.pack(9, 0, -1, float("nan"), float("nan"), b"")
+        message = count + rest[: ITEM.size] + wrong + rest[ITEM.size :]
+        with pytest.raises(InvalidInput):
+            self.reader.read(memoryview(message), placed(written))
+        self.writer = ShmWriter()
+
+
+@pytest.fixture(autouse=True)
+def few_layouts(request: pytest.FixtureRequest) -> Iterator[None]:
+    with pytest.MonkeyPatch.context() as patch:
+        if "layout" in request.node.name:
+            patch.setattr(shm_layout, "_MOST", 4)
+        yield
+
+
+def test_a_writer_and_a_reader_agree_on_layouts_whatever_was_lost_or_refused() -> None:
+    run_state_machine_as_test(WritersAndReaders, settings=settings(max_examples=many(60), deadline=None))
+
+
+def test_a_reader_takes_no_layout_beyond_the_limit_and_no_message_of_too_many_acts() -> None:
+    reader = ShmReader(Limits(requests=2))
+    text = json.dumps(["s", "robot", [], []]).encode()
+    item = ITEM.pack(4, len(text), -1, float("nan"), float("nan"), b"")
+    with pytest.raises(InvalidInput, match="below 4"):
+        reader.read(memoryview(COUNT.pack(1) + item + text), np.zeros(64, np.uint8))
+    with pytest.raises(InvalidInput, match="the limit is 2"):
+        reader.read(memoryview(COUNT.pack(3) + item * 3 + text), np.zeros(64, np.uint8))
+
+
+@pytest.mark.parametrize("name", ["", "x" * 129, "a\nb", "x" * 100_000])
+def test_names_have_the_limits_of_a_frame_in_layouts_also(name: str) -> None:
+    """1,024 layouts with names of a message's size each would hold 256 MB."""
+    text = json.dumps(["s", "robot", [], [[name, [1]]]]).encode()
+    item = ITEM.pack(0, len(text), -1, float("nan"), float("nan"), b"")
+    with pytest.raises(InvalidInput, match="named"):
+        ShmReader(Limits()).read(memoryview(COUNT.pack(1) + item + text), np.zeros(64, np.uint8))

@@ -11,7 +11,7 @@ import re
 import socket
 import struct
 from collections.abc import Callable, Iterator
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
@@ -206,7 +206,7 @@ class KeyedReplica:
         engines = SimpleNamespace(
             engines=[self.engine], dead=set(), frozen=set(), prefer=0, lose_reply=False, stopping=False, frames=[]
         )
-        way = _Near(asdict(self.local.address), Credentials(key or "")) if near else InProcess(engines)  # type: ignore[arg-type]
+        way = _Near(self.local.address, Credentials(key or "")) if near else InProcess(engines)  # type: ignore[arg-type]
         agent._connection = Connection(agent.url, lambda: way, CodecChoice("raw"), 5.0, 5.0)  # type: ignore[arg-type]
         return agent
 
@@ -247,12 +247,14 @@ class PlasmaChannel:
 
     frames: ClassVar[dict[bytes, bytes]] = {}
 
+    capacity = 2**20
+
     def __init__(self, key: bytes) -> None:
         self.ref = SimpleNamespace(binary=lambda: key)
         self._key = key
 
-    def read(self) -> bytes:
-        return self.frames[self._key]
+    def read(self) -> np.ndarray:
+        return np.frombuffer(self.frames[self._key], np.uint8)
 
 
 @contextlib.contextmanager

@@ -19,11 +19,12 @@ from typing import Any
 
 import numpy as np
 
-from vlagents_ray.errors import MalformedMessage, MessageTooLarge
+from vlagents_ray.errors import InvalidInput, MalformedMessage, MessageTooLarge
 from vlagents_ray.interface import POLICY, Act, Obs
 from vlagents_ray.protocol.frame_layout import Buffer
 from vlagents_ray.protocol.frames import check_request
 from vlagents_ray.protocol.messages import Limits, RankName, Reply, Request, is_name
+from vlagents_ray.protocol.values import require_array_name
 
 _ALIGN = 64
 _ID_BYTES = 40  # maximum length of a request's id
@@ -156,20 +157,24 @@ class ShmReader:
         """
         try:
             (count,) = COUNT.unpack_from(message)
+            if count > self._limits.requests:
+                raise MessageTooLarge(f"local: got {count} acts, the limit is {self._limits.requests} in one message")
             text_at = COUNT.size + count * ITEM.size
             requests = []
             at = 0
             for item in ITEM.iter_unpack(message[COUNT.size : text_at]):
                 number, text_bytes, step, deadline_ms, gripper, request_id = item
                 if text_bytes:
-                    if len(self._known) >= _MOST:
-                        raise MessageTooLarge(f"local: more than {_MOST} layouts on one connection; connect again")
+                    if number >= _MOST:
+                        raise MessageTooLarge(f"local: layout {number}, want a number below {_MOST}")
                     self._known[number] = self._layout(bytes(message[text_at : text_at + text_bytes]))
                     text_at += text_bytes
                 layout = self._known[number]
                 if at + layout.size > memory.size:
                     raise MalformedMessage(f"local: {memory.size} bytes of memory, the arrays need more")
-                if not is_name(name_of_request := request_id.rstrip(b"\0").decode()):
+                id_bytes = request_id.rstrip(b"\0")
+                name_of_request = id_bytes.decode()
+                if not id_bytes.isalnum() and not is_name(name_of_request):  # the first of these is no call of Python
                     raise MalformedMessage(f"local: request_id: got {name_of_request!r}, want visible ASCII characters")
                 obs = Obs(gripper=None if math.isnan(gripper) else gripper)
                 for name, shape, place in layout.cameras:
@@ -188,7 +193,7 @@ class ShmReader:
                 )
                 requests.append(request)
         except (struct.error, ValueError, KeyError, TypeError) as error:
-            if isinstance(error, MalformedMessage | MessageTooLarge):
+            if isinstance(error, InvalidInput):
                 raise
             raise MalformedMessage(f"local: not an act ({type(error).__name__}: {error})") from error
         if len(requests) != count or not count:
@@ -211,6 +216,7 @@ class ShmReader:
         ):
             if not isinstance(name, str) or not isinstance(shape, list) or len(shape) != dimensions:
                 raise MalformedMessage(f"local: got {name!r} of {shape!r}, want a name and {dimensions} dimensions")
+            require_array_name(name)
             if not all(type(n) is int and n >= 0 for n in shape) or (dimensions == 3 and shape[2] != 3):
                 raise MalformedMessage(f"local: {name!r}: got shape {shape!r}, want (H, W, 3) or (D,)")
             if (size := math.prod(shape[:2])) > most:

@@ -173,10 +173,7 @@ def read_obs(node: Any, reader: ValueReader) -> Obs:
     if max(len(cameras), len(state)) > limits.cameras:
         raise MessageTooLarge(f"obs: got {len(cameras)} cameras and {len(state)} states, the limit is {limits.cameras}")
     for name in (*cameras, *state):
-        if not 0 < len(name) <= NAME_CHARACTERS or not name.isprintable():
-            raise InvalidObservation(
-                f"obs: got a camera or state named {name[:40]!r}, want 1 to {NAME_CHARACTERS} printable characters"
-            )
+        require_array_name(name)
     if gripper is not None and not is_number(gripper):
         raise InvalidObservation(f"gripper: got {shown(gripper)}, want a number in [0, 1] where 1 = open")
     reader.decode_images(cameras)
@@ -189,6 +186,14 @@ def read_obs(node: Any, reader: ValueReader) -> Obs:
         },
         info=reader.value(info),
     )
+
+
+def require_array_name(name: str) -> None:
+    """Raise `InvalidObservation` unless a text can be the name of a camera or of a part of the state."""
+    if not 0 < len(name) <= NAME_CHARACTERS or not name.isprintable():
+        raise InvalidObservation(
+            f"obs: got a camera or state named {name[:40]!r}, want 1 to {NAME_CHARACTERS} printable characters"
+        )
 
 
 def as_camera(name: str, image: Any, limits: Limits) -> np.ndarray:

@@ -137,7 +137,8 @@ class PendingRequest:
         if self.over:
             return
         self.over = True
-        self.drop_preparation()
+        if self.preparation is not None:
+            self.drop_preparation()
         try:
             self.done(reply)
         except Exception:
@@ -173,7 +174,18 @@ class Message:
         rank: Class of that request.
     """
 
-    __slots__ = ("_asked", "_decoded", "_lock", "_missing", "_stats", "_then", "arrived", "replies", "transport")
+    __slots__ = (
+        "__weakref__",
+        "_asked",
+        "_decoded",
+        "_lock",
+        "_missing",
+        "_stats",
+        "_then",
+        "arrived",
+        "replies",
+        "transport",
+    )
 
     def __init__(self, stats: MetricsBuffer, transport: str, op: str = "unknown", rank: str = "robot") -> None:
         self._stats = stats
@@ -209,7 +221,9 @@ class Message:
 
     def put(self, place: int, reply: Reply) -> None:
         """Store the answer to the request at that index; a second answer is ignored."""
-        if reply.error is not None:
+        if reply.error is None:
+            reply.timing["decode_ms"] = (self._decoded - self.arrived) * 1e3
+        else:
             reply.error.__traceback__ = None  # its frames would retain this message and its bytes
         with self._lock:
             if self.replies[place] is not None:
@@ -229,7 +243,6 @@ class Message:
 
     def frame(self) -> bytes:
         """Encode and record the replies as a frame with complete `timing`."""
-        self._set_decode_ms()
         data = encode_replies(self.replies, arrived=self.arrived)
         self.record()
         return data
@@ -240,7 +253,6 @@ class Message:
         Returns:
             The replies in compact form if they fit into that, otherwise as a frame; and whether they are compact.
         """
-        self._set_decode_ms()
         compact = write_answers(self.replies, arrived=self.arrived)
         data = encode_replies(self.replies, arrived=self.arrived) if compact is None else compact
         return data, compact is not None
@@ -272,17 +284,10 @@ class Message:
 
     def _written(self, begun: float) -> None:
         ended = time.perf_counter()
-        self._set_decode_ms()
         for reply in self.replies:
             reply.timing["encode_ms"] = (ended - begun) * 1e3
             reply.timing["total_ms"] = (ended - self.arrived) * 1e3
         self.record()
-
-    def _set_decode_ms(self) -> None:
-        decode_ms = (self._decoded - self.arrived) * 1e3
-        for reply in self.replies:
-            if reply.error is None:
-                reply.timing["decode_ms"] = decode_ms
 
     def record(self) -> None:
         """Record the requests for the metrics. Call this after sending if possible, so that no client waits."""

@@ -38,11 +38,13 @@ from vlagents_ray.serve.token_bucket import TokenBucket
 logger = logging.getLogger(__name__)
 
 BACKLOG = 128
+MOST_UNANSWERED = 256  # unanswered messages of a client; further ones stay unread in its connection
 POLICY_VIOLATION, _INTERNAL_ERROR = 1008, 1011  # WebSocket close codes
 # Maximum number of connections that a server accepts in a second; each takes some time of the policy's thread.
 _ACCEPTED_PER_S = 200.0
 # Reasons for not polling a connection.
 DECODING, THROTTLED = "a frame is decoded on another thread", "the key is over its rate"
+BACKLOGGED = "too much of it is unanswered"
 
 _TIMESTAMP = 35  # SO_TIMESTAMPNS of Linux, which Python's socket does not name
 _STAMP = struct.Struct("@qq")  # wall clock, s and ns

@@ -34,7 +34,8 @@ from vlagents_ray.protocol.messages import Limits, LocalAddress, PlasmaAddress
 from vlagents_ray.ray_tools import private
 from vlagents_ray.serve.access.api_keys import NoKey
 from vlagents_ray.serve.endpoints.connection import BACKLOG
-from vlagents_ray.serve.endpoints.shm import UnixServer
+from vlagents_ray.serve.endpoints.shm import UnixServer, counted_array
+from vlagents_ray.serve.engine.admission import Admission
 from vlagents_ray.serve.engine.engine import Engine
 
 logger = logging.getLogger(__name__)
@@ -53,12 +54,12 @@ class Channel:
     capacity: int  # maximum size of a frame, bytes
     leased: float = 0.0  # time of the latest lease, s, monotonic
 
-    def read(self) -> bytes:
-        """Return a copy of the written frame, without waiting; raise `MalformedMessage` if there is none."""
+    def read(self) -> np.ndarray:
+        """Return a copy of the frame, (N,) uint8, without waiting; raise `MalformedMessage` if there is none."""
         found = self._take()
         if found.metadata != PlasmaAddress.TAG:  # Ray's parser below trusts its input, as everywhere
             raise MalformedMessage("plasma: what the channel holds is no frame; is this a client of vlagents_ray?")
-        return b"".join(private.channel_pieces(found.data))
+        return np.frombuffer(b"".join(private.channel_pieces(found.data)), np.uint8)
 
     def intact(self) -> bool:
         """Discard an unread frame; return False if the writer was killed during a write, which locks the channel."""
@@ -168,7 +169,9 @@ class PlasmaServer(UnixServer):
     def __init__(self, engine: Engine, limits: Limits) -> None:
         """Prepare the pool and the socket; `limits` are the limits of a frame."""
         self.pool = Pool(limits)
-        super().__init__(engine, NoKey.INSIDE, limits, partial(LeasedChannel, self.pool))  # the cluster needs no key
+        super().__init__(
+            engine, NoKey.INSIDE, limits, partial(LeasedChannel, self.pool, engine.admission)
+        )  # the cluster needs no key
         folder = private.plasma_folder()
         # The name is no longer than that of the store's socket in the same folder, since socket paths are limited.
         self._path = folder / f"vla{secrets.token_hex(4)}"
@@ -194,8 +197,8 @@ class PlasmaServer(UnixServer):
 class LeasedChannel:
     """A `Payload`: the channel of one client, which leases a larger one for larger frames."""
 
-    def __init__(self, pool: Pool) -> None:
-        self._pool = pool
+    def __init__(self, pool: Pool, admission: Admission) -> None:
+        self._pool, self._admission = pool, admission
         self._channel: Channel | None = None
 
     def read(self, message: memoryview, descriptors: list[int]) -> tuple[np.ndarray, bool, memoryview]:
@@ -206,7 +209,7 @@ class LeasedChannel:
         if self._channel is None or self._channel.ref.binary() != key:
             self.free()
             self._channel = self._pool.claim(key)
-        memory = np.frombuffer(self._channel.read(), np.uint8)
+        memory = counted_array(self._admission, self._channel.capacity, self._channel.read)
         return memory, bool(flags & LocalAddress.COMPACT), message[PlasmaAddress.REQUEST.size :]
 
     def freed(self) -> int:

@@ -33,7 +33,9 @@ from vlagents_ray.protocol.messages import OPS, Limits, LocalAddress, Op, Reply,
 from vlagents_ray.serve.access.api_keys import Caller, NoKey
 from vlagents_ray.serve.endpoints.connection import (
     BACKLOG,
+    BACKLOGGED,
     DECODING,
+    MOST_UNANSWERED,
     POLICY_VIOLATION,
     STAMP_SPACE,
     Admit,
@@ -44,7 +46,7 @@ from vlagents_ray.serve.endpoints.connection import (
     has_unread,
     time_in_socket_s,
 )
-from vlagents_ray.serve.engine.admission import MessageAdmission
+from vlagents_ray.serve.engine.admission import Admission, MessageAdmission
 from vlagents_ray.serve.engine.engine import Engine
 from vlagents_ray.serve.engine.sender import REFUSED, Sender
 from vlagents_ray.serve.requests import Message
@@ -118,6 +120,8 @@ class UnixConnection(PolledConnection):
         self._reader = shm_layout.ShmReader(server.limits)
         self._connected_at = time.monotonic()
         self._key: bytes | None = None  # the key as sent
+        self._unanswered = 0  # number of messages
+        self._paused = False  # whether too many are unanswered
         if isinstance(server.admit, NoKey):
             self.caller = server.admit
             self._sender = Sender(server.engine, server.name, caller=server.admit)
@@ -143,7 +147,12 @@ class UnixConnection(PolledConnection):
             if not data:
                 self.disconnect()
                 return
-            if (sender := self._sender or self._authenticate(bytes(data[:_KEY_BYTES]))) is not None:
+            with self._sending:
+                self._unanswered += 1
+            if (sender := self._sender or self._authenticate(bytes(data[:_KEY_BYTES]))) is None:
+                with self._sending:
+                    self._unanswered -= 1  # a valid key is not answered
+            else:
                 self._receive(sender, message, time_in_socket_s(control), data, descriptors)
         except VLAgentsError as error:
             message.refuse(error)
@@ -155,6 +164,10 @@ class UnixConnection(PolledConnection):
                 os.close(descriptor)
         if self._sender is not None and self._sender.rated:
             self._is_throttled()
+        with self._sending:
+            self._paused = self._unanswered >= MOST_UNANSWERED and not self._ended
+        if self._paused:
+            self._pause(BACKLOGGED)
 
     def _receive(
         self, sender: Sender, message: Message, waited_s: float, data: memoryview, descriptors: list[int]
@@ -217,6 +230,10 @@ class UnixConnection(PolledConnection):
     def _send(self, frame: bytes, compact_form: bool) -> None:
         flags = LocalAddress.COMPACT if compact_form else 0
         with self._sending:
+            self._unanswered -= 1
+            if self._paused and self._unanswered < MOST_UNANSWERED:
+                self._paused = False
+                self._call_soon(partial(self._resume, BACKLOGGED))
             if self._ended:
                 return
             freed = self._payload.freed()
@@ -244,7 +261,7 @@ class ShmServer(UnixServer):
 
     def __init__(self, engine: Engine, limits: Limits, admit: Admit | NoKey, ops: Sequence[Op] = OPS) -> None:
         """Create the server and the address for the metadata; see `UnixServer`."""
-        super().__init__(engine, admit, limits, partial(MemoryFiles, limits), ops)
+        super().__init__(engine, admit, limits, partial(MemoryFiles, limits, engine.admission), ops)
         self.address = LocalAddress(
             f"vlagents-ray-{secrets.token_hex(16)}", boot_id(), keyed=not isinstance(admit, NoKey)
         )
@@ -259,8 +276,8 @@ class ShmServer(UnixServer):
 class MemoryFiles:
     """A `Payload`: the memory files of one client, read in place and returned when no view is left."""
 
-    def __init__(self, limits: Limits) -> None:
-        self._limits = limits
+    def __init__(self, limits: Limits, admission: Admission) -> None:
+        self._limits, self._admission = limits, admission
         self._files: dict[int, mmap.mmap] = {}
         self._views: dict[int, weakref.ref[np.ndarray]] = {}  # the array over each file, until it is garbage-collected
         self._freed: set[int] = set()  # freed files that no reply has reported yet
@@ -281,8 +298,7 @@ class MemoryFiles:
             self._views[number] = weakref.ref(memory, partial(self._release, number))
         else:  # the policy already holds views of many files
             self._freed.add(number)
-            memory = memory.copy()
-            memory.flags.writeable = False
+            memory = counted_array(self._admission, length, memory.copy)
         return memory, bool(flags & LocalAddress.COMPACT), message[LocalAddress.REQUEST.size :]
 
     def freed(self) -> int:
@@ -318,6 +334,22 @@ class MemoryFiles:
         finally:
             os.close(descriptor)
         self._files[number] = mapped
+
+
+def counted_array(admission: Admission, size: int, read: Callable[[], np.ndarray]) -> np.ndarray:
+    """Return the array of `size` bytes that `read` creates, counted as in flight for as long as anything views it.
+
+    Raises the errors of `Admission.hold`, before the array is created; the share of robots is not used.
+    """
+    admission.hold(size, False, 0)
+    try:
+        memory = read()
+    except BaseException:
+        admission.release(size)
+        raise
+    memory.flags.writeable = False
+    weakref.finalize(memory, admission.release, size).atexit = False
+    return memory
 
 
 def _has_hung_up(connection: socket.socket) -> bool:

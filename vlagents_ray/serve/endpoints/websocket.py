@@ -50,8 +50,10 @@ from vlagents_ray.serve.access.api_keys import Caller, Identity, NoKey, token_of
 from vlagents_ray.serve.access.origin_check import require_own_page
 from vlagents_ray.serve.endpoints.connection import (
     BACKLOG,
+    BACKLOGGED,
     DECODING,
     LEAST_WAIT_S,
+    MOST_UNANSWERED,
     POLICY_VIOLATION,
     THROTTLED,
     Admit,
@@ -79,10 +81,8 @@ _HANDSHAKE_BYTES = 16 * 1024  # maximum size of a handshake
 _HANDSHAKE_S = 5.0  # maximum time of a handshake
 _REFUSED_S = 1.0  # maximum time for which the refusal of a handshake is delayed
 _END_OF_HEADERS = b"\r\n\r\n"
-_UNANSWERED = 256  # maximum number of a client's unanswered messages; further ones stay unread in its connection
 _GOING_AWAY, _UNSUPPORTED_DATA, _TRY_AGAIN_LATER = 1001, 1003, 1013  # close codes
-# Further reasons for not polling a connection.
-_BACKLOGGED, _REFUSED = "too much of it is unanswered", "its handshake is refused"
+_REFUSED = "its handshake is refused"  # a further reason for not polling a connection
 
 # The kernel detects that a peer has disappeared: after 20 s of silence it sends three probes, 5 s apart.
 _KEEPALIVE = (("TCP_KEEPIDLE", 20), ("TCP_KEEPINTVL", 5), ("TCP_KEEPCNT", 3), ("TCP_USER_TIMEOUT", 35_000))
@@ -301,7 +301,7 @@ class WebSocketConnection(PolledConnection):
         with self._sending:
             paused = self._paused = self._is_backlogged() and self._protocol.state is State.OPEN
         if paused:
-            self._pause(_BACKLOGGED)
+            self._pause(BACKLOGGED)
 
     def _charge_abuse(self) -> None:
         """Charge a message to the key, as for a message that is refused, before the connection ends."""
@@ -326,7 +326,7 @@ class WebSocketConnection(PolledConnection):
 
     def _is_backlogged(self) -> bool:
         """Return whether the client has too many unanswered messages or bytes; the caller holds the lock."""
-        return self._unanswered >= _UNANSWERED or self._unanswered_bytes > self._limits.body_bytes
+        return self._unanswered >= MOST_UNANSWERED or self._unanswered_bytes > self._limits.body_bytes
 
     def _discard(self) -> None:
         self._partial = None
@@ -479,7 +479,7 @@ class WebSocketConnection(PolledConnection):
             resume = self._paused and not self._is_backlogged()
             self._paused = self._paused and not resume
         if resume:
-            self._call_soon(partial(self._resume, _BACKLOGGED))
+            self._call_soon(partial(self._resume, BACKLOGGED))
         self._answer(message)
 
     def _write(self, message: Message) -> None:

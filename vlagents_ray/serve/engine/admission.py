@@ -16,9 +16,10 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import threading
+import weakref
 from collections.abc import Callable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
-from typing import TypeVar
+from typing import Any, TypeVar
 
 from vlagents_ray.errors import MessageTooLarge, Overloaded, PolicyUnavailable, VLAgentsError
 from vlagents_ray.images import thread_map
@@ -29,6 +30,7 @@ T = TypeVar("T")
 # Above these another thread decodes: a megapixel of decoded bytes, and the time in which one core decodes such a JPEG.
 INLINE_BYTES = 3 * 2**20
 INLINE_S = 8e-3
+REQUEST_BYTES = 2048  # memory of a request from its arrival until its answer, without images and arrays
 _ROBOTS_SHARE = 0.25  # share of the bytes in flight that is reserved for robots
 
 
@@ -42,6 +44,7 @@ class Admission:
     def __init__(self, in_flight_bytes: int) -> None:
         self._limit = in_flight_bytes
         self.held = 0  # number of bytes in flight
+        self.messages: dict[weakref.ref[Any], int] = {}  # bytes to release with each message that has no admission
         self._lock = threading.Lock()
         self._threads: dict[bool, ThreadPoolExecutor] = {}  # the thread pools for robots and (False) for others
         self._closed = False
@@ -71,6 +74,12 @@ class Admission:
 
     def release(self, size: int) -> None:
         """Count `size` bytes as no longer in flight."""
+        with self._lock:
+            self.held -= size
+
+    def release_with(self, message: weakref.ref[Any]) -> None:
+        """Release the bytes of a message that is answered or dropped: the callback of the weak references to it."""
+        size = self.messages.pop(message, 0)
         with self._lock:
             self.held -= size
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import uuid
+import weakref
 from collections.abc import Sequence
 from functools import partial
 from typing import TYPE_CHECKING, TypeVar
@@ -12,7 +13,7 @@ from vlagents_ray.errors import DeadlineExceeded, OutcomeUnknown, TooManyRequest
 from vlagents_ray.protocol.frames import Decoded
 from vlagents_ray.protocol.messages import Limits, Reply
 from vlagents_ray.serve.access.api_keys import Caller, Identity, NoKey
-from vlagents_ray.serve.engine.admission import MessageAdmission
+from vlagents_ray.serve.engine.admission import REQUEST_BYTES, MessageAdmission
 from vlagents_ray.serve.requests import RANKS, Answered, Message, Origin, PendingRequest, Rank
 
 if TYPE_CHECKING:
@@ -142,7 +143,20 @@ class Sender:
         engine, now, (requests, refused) = self._engine, self._engine.clock(), decoded
         watched = engine.observers.any
         sent: list[PendingRequest] = []
-        message.expect(len(requests) + len(refused), partial(self._answered, then, admission, sent if watched else ()))
+        size = REQUEST_BYTES * len(requests)
+        overloaded = None
+        try:
+            if admission is not None:
+                admission.grow(size)
+            elif requests:
+                is_robot = requests[0].rank == "robot" and (self._caller is None or self._caller.rank != "simulation")
+                engine.admission.hold(size, is_robot, 0)
+                # Also released if the requests are dropped without an answer, as those of an ended connection.
+                engine.admission.messages[weakref.ref(message, engine.admission.release_with)] = size
+        except VLAgentsError as error:
+            overloaded = error
+        answered = partial(self._answered, then, admission, sent if watched else ())
+        message.expect(len(requests) + len(refused), answered)
         place = 0
         for request in requests:
             while place in refused:
@@ -164,7 +178,10 @@ class Sender:
             for pending in sent:
                 pending.files, pending.kept = (admission and admission.files) or {}, {}
                 engine.observers.on_request(pending)
-        if self._caller is None:
+        if overloaded is not None:
+            for pending in sent:
+                pending.fail(overloaded)
+        elif self._caller is None:
             engine.submit(sent)
         else:
             engine.submit(self._admitted(self._caller, sent, admission is not None or self._counted))
@@ -193,7 +210,11 @@ class Sender:
         return allowed
 
     def _answered(
-        self, then: Answered, admission: MessageAdmission | None, watched: Sequence[PendingRequest], message: Message
+        self,
+        then: Answered,
+        admission: MessageAdmission | None,
+        watched: Sequence[PendingRequest],
+        message: Message,
     ) -> None:
         if self._engine.drain_list.ask(self.session_id):
             self._asked_to_reconnect = True
