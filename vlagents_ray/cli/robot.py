@@ -266,6 +266,8 @@ def _say_outcome(report: LoopReport, say: Callable[[str], None], *, led: bool) -
             say(f"  {ticks} x {cause}, first: {report.reasons[cause]}")
     if report.mostly_safe is not None:  # `run_loop` has logged the reason and the cure
         say(f"MOSTLY SAFE ACTIONS, exit status {MOSTLY_SAFE}")
+    if report.blocking is not None:
+        say(report.blocking)
     for bark in report.barks:
         say(f"stopped: {bark}")
     say(f"against jitter: {', '.join(report.means)}")

@@ -3,7 +3,8 @@
 Nothing moves without --move, and then each motion only after a person at the robot has agreed. A simulated arm,
 "mujoco:ARM", is checked without a person.
 
-Exit status: 0 if no check found anything, 1 if one did, 2 if it could not run.
+Exit status: 0 if no check found anything, 1 if one did, 2 if it could not run, 3 if the robot does not declare what the
+checks of its motion need.
 """
 
 from __future__ import annotations
@@ -24,6 +25,8 @@ from vlagents_ray.robot.loop import Robot, opened, robot_named
 from vlagents_ray.robot.mujoco_arm import SimulatedClock
 from vlagents_ray.robot.ros import RosRobot, read_settings
 
+UNDECLARED = 3  # exit status
+
 
 def main(arguments: Sequence[str]) -> int:
     """Run the command, and return its exit status."""
@@ -33,19 +36,24 @@ def main(arguments: Sequence[str]) -> int:
         parser.error("want a robot by name, or one behind topics of ROS 2 (--ros FILE)")
     try:
         with contextlib.ExitStack() as stack:
+            if options.json:  # standard output is for the document alone, without the questions to the operator
+                stack.enter_context(contextlib.redirect_stdout(sys.stderr))
             report = _checked(options, stack)
+        report.robot = options.robot or options.ros
     except VLAgentsError as error:
         print(f"{type(error).__name__}: {error}", file=sys.stderr)  # noqa: T201
         return 2
     if options.json:
-        document = {"ok": report.ok, **asdict(replace(report, pictures={}))}
+        document = {"ok": report.ok, "verdict": report.verdict, **asdict(replace(report, pictures={}))}
         print(json.dumps(document, indent=2))  # noqa: T201
     else:
         print("\n".join(report.lines()))  # noqa: T201
     if options.out:
         report.write(options.out)
         print(f"report: {options.out}", file=sys.stderr)  # noqa: T201
-    return 0 if report.ok else 1
+    if report.findings:
+        return 1
+    return 0 if report.ok else UNDECLARED
 
 
 def _checked(options: argparse.Namespace, stack: contextlib.ExitStack) -> RobotReport:

@@ -44,8 +44,10 @@ _HOLD_S = 1.0  # time after it in which it must be measured
 _RUNAWAY = 3  # small moves; an arm that is farther from where it should be is stopped at once
 _STOP_S = 0.1  # longest call of `stop`
 _SKEW_S = (-1.0, 0.1)  # age of an observation's time stamp: as SKEW_S of the chunk player, s
+_FROZEN_S = 1.0  # time in which each camera must give a new picture
 _MOST_M = 5.0  # an arm with a longer reach gives millimetres
 _RED = 40  # of 255, by which red has to exceed green and blue where the card is
+_DECLARE = "the robot's contract does not declare what this check needs"
 
 
 class Operator:
@@ -110,26 +112,49 @@ class RobotReport:
     skipped: dict[str, str] = field(default_factory=dict)  # check: the reason
     figures: dict[str, float] = field(default_factory=dict)  # measured, with the unit in the name
     pictures: dict[str, np.ndarray] = field(default_factory=dict)  # (H, W, 3) uint8 by title
+    undeclared: str = ""  # what the robot has to declare before its motion can be checked; "" if nothing is missing
+    robot: str = ""  # its name
+    at: float = field(default_factory=time.time)  # s since 1970
 
     @property
     def ok(self) -> bool:
-        """Whether no check found a violation."""
-        return not self.findings
+        """Whether no check found a violation, and the robot declares what the checks need."""
+        return not self.findings and not self.undeclared
+
+    @property
+    def verdict(self) -> str:
+        """The result in one sentence."""
+        if self.findings:
+            return f"FOUND {len(self.findings)}: do not let a policy move this robot"
+        if self.undeclared:
+            return f"NOT CHECKED: {self.undeclared}"
+        if self.skipped:
+            return f"nothing found; {len(self.skipped)} of {len(CHECKS)} checks were not made"
+        return "nothing found in any check"
 
     def lines(self) -> list[str]:
         """Return the report as lines of text."""
+        reasons: dict[str, list[str]] = {}
+        for name, reason in self.skipped.items():
+            reasons.setdefault(reason, []).append(name)
         return [
             *(f"FOUND {finding}" for finding in self.findings),
             *(f"ok {name}: {CHECKS[name]}" for name in self.passed),
-            *(f"not checked {name}: {reason}" for name, reason in self.skipped.items()),
+            *(f"not checked {', '.join(names)}: {reason}" for reason, names in reasons.items()),
             *(f"{name}: {value:.3g}" for name, value in self.figures.items()),
+            self.verdict,
         ]
 
     def write(self, file: str | Path) -> None:
         """Write the report with its pictures as one HTML page, which needs no network."""
-        style = "body{font-family:sans-serif}figure{display:inline-block;margin:8px}img{height:240px}"
-        page = f"<!doctype html><meta charset=utf-8><title>Check of a robot</title><style>{style}</style>"
-        page += f"<h1>Check of a robot</h1><ul>{''.join(f'<li>{html.escape(line)}</li>' for line in self.lines())}</ul>"
+        date = time.strftime("%Y-%m-%d %H:%M", time.localtime(self.at))
+        colour = "#b00020" if self.findings else "#8a5a00" if self.undeclared else "#1b6e1b"
+        style = "body{font:16px/1.5 sans-serif;max-width:60em;margin:2em auto;padding:0 1em}"
+        style += f"h2{{color:{colour}}}figure{{display:inline-block;margin:8px}}img{{height:240px}}"
+        page = f"<!doctype html><meta charset=utf-8><title>Check of {html.escape(self.robot)}</title>"
+        page += f"<style>{style}</style><h1>Check of {html.escape(self.robot)}</h1>"
+        page += f"<h2>{html.escape(self.verdict)}</h2><p>{date}</p>"
+        page += f"<ul>{''.join(f'<li>{html.escape(line)}</li>' for line in self.lines()[:-1])}</ul>"
         for title, picture in self.pictures.items():
             url = data_url("image/jpeg", encode_jpeg(picture))
             page += f'<figure><img src="{url}"><figcaption>{html.escape(title)}</figcaption></figure>'
@@ -162,7 +187,8 @@ def examine(
         The findings, and which checks passed or were not made.
     """
     contract = contract or contract_of(robot)
-    suite = _Suite(robot, contract, operator, 1 / (hz or contract.control_hz or 50.0), latency_s, clock)
+    report = RobotReport(robot=type(robot).__name__)
+    suite = _Suite(robot, contract, operator, 1 / (hz or contract.control_hz or 50.0), latency_s, clock, report)
     try:
         suite.at_rest()
         suite.in_motion()
@@ -211,11 +237,16 @@ class _Suite:
         first = self._observe()
         self._layout = _Layout.find(self._robot, self._contract, first)
         check_observation(first, self._contract)
+        if self._layout is None or self._contract.action.relative is None:
+            self.report.undeclared = _undeclared(self._contract)
+        if self._contract == Contract():
+            self.report.skipped["observation"] = _DECLARE
         self._passes("observation")
         names = getattr(self._robot, "joint_names", ())
         for number, ours, theirs in reordered(names, self._contract.action.names or ())[:1]:
             cure = "give actions and state the contract's order of joints"
             self.find("order", f"{ours!r} as joint {number} of the arm", f"{theirs!r}, as the contract states", cure)
+        last = first
         for _ in range(20):
             self._clock.sleep(self._period_s)
             last = self._observe()
@@ -229,6 +260,7 @@ class _Suite:
         self._check_units(last)
         self._check_limits(last)
         self._check_stop()
+        self._check_new_pictures()
         self._check_cameras()
         self._check_place(last)
 
@@ -238,7 +270,7 @@ class _Suite:
         if self.report.findings:
             return
         if layout is None or self._contract.action.relative is None:
-            self.skip_others("the contract states no joint targets or deltas (action.dim, space, delta), or no state")
+            self.skip_others(_DECLARE)
             return
         if not self._agreed("the command of the present pose, at which nothing should move"):
             return
@@ -347,7 +379,27 @@ class _Suite:
                 self.find("stop", f"{took_s:.3g} s for stop{place}", f"at most {_STOP_S} s", "send it and return")
                 return
 
+    def _check_new_pictures(self) -> None:
+        """Find cameras that repeat one picture; the noise of a sensor changes each picture, also of a still scene."""
+        if getattr(self._robot, "simulated", False):
+            return
+        first = {name: picture.copy() for name, picture in self._observe().cameras.items()}
+        began_s, still = self._clock.monotonic(), set(first)
+        while still and self._clock.monotonic() - began_s < _FROZEN_S:
+            self._clock.sleep(self._period_s)
+            pictures = self._observe().cameras
+            still = {name for name in still if name in pictures and np.array_equal(pictures[name], first[name])}
+        for name in sorted(still):
+            got = f"the same picture of {name!r}, to the bit, for {_FROZEN_S:g} s"
+            cure = (
+                "the camera hangs, or observe returns a stored picture: restart it, and read each frame once; a "
+                "simulated robot declares `simulated = True`"
+            )
+            self.find("cameras", got, "new pictures, which differ by the noise of the sensor", cure)
+
     def _check_cameras(self) -> None:
+        if any(finding.check == "cameras" for finding in self.report.findings):
+            return
         before = self._observe().cameras
         self.report.pictures |= before
         for camera in before:
@@ -552,6 +604,21 @@ class _Suite:
             self.find("gripper", got, "a gripper that closes, and a smaller opening", cure)
         opening(spec.gripper_open)
         self._passes("gripper")
+
+
+def _undeclared(contract: Contract) -> str:
+    """Return what a robot has to declare before its motion can be checked."""
+    action = contract.action
+    missing = [name for name in ("dim", "space", "delta") if getattr(action, name) is None]
+    if missing:
+        what = f"its `action` has no {', '.join(missing)}"
+    else:
+        what = "its state has no `joints` of the size of an action, or its actions are not joints"
+    return (
+        f"the motion cannot be checked, as {what}. Give the class a `contract`, such as "
+        f"Contract(state={{'joints': StateSpec(6, 'rad')}}, action=ActionSpec(dim=6, space='joint', delta=False)); "
+        f"see docs/arms.md"
+    )
 
 
 @dataclass(frozen=True)

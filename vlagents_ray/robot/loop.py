@@ -187,6 +187,7 @@ class LoopReport:
     jitter: dict[str, float] = field(default_factory=dict)  # see `vlagents_ray.robot.pacing.jitter`
     work_p50_ms: float = 0.0  # from the due time of a tick to its applied action
     work_p99_ms: float = 0.0
+    apply_p50_ms: float = 0.0  # of `robot.apply` alone
     safe: dict[Cause, int] = field(default_factory=dict)  # ticks with the safe action or without any, by cause
     reasons: dict[Cause, str] = field(default_factory=dict)  # the first reason of each cause, in words
     waiting: int = 0  # ticks at which the robot held still, with all rows used up and no new answer
@@ -216,6 +217,23 @@ class LoopReport:
             f"{self.reasons.get(cause, cause)}. If answers come too late, use a lower rate (hz), a policy with longer "
             "chunks, or let a tick wait for its answer (deadline_s, --deadline-ms)"
         )
+
+    @property
+    def blocking(self) -> str | None:
+        """A warning with its cure if `robot.apply` takes more than half of a tick; else None."""
+        tick_ms = 1e3 / self.hz
+        if self.apply_p50_ms <= tick_ms / 2:
+            return None
+        return (
+            f"apply takes {self.apply_p50_ms:.3g} ms of a tick of {tick_ms:.3g} ms: send the command and return, do "
+            "not wait until the arm is there"
+        )
+
+    def log_warnings(self) -> None:
+        """Log `mostly_safe` and `blocking`, if they apply."""
+        for warning in (self.mostly_safe, self.blocking):
+            if warning is not None:
+                logger.warning("%s", warning)
 
     def count(self, held: Held) -> None:
         """Count a tick without an action of the policy."""
@@ -345,8 +363,7 @@ def run_loop(
             control.running = False
             report.barks = control.stops[stops:]
             robot.stop()  # before the watchdog and the recorder end
-    if report.mostly_safe is not None:
-        logger.warning("%s", report.mostly_safe)
+    report.log_warnings()
     return report
 
 
@@ -366,6 +383,7 @@ class _Run:
     fit: Fit | None  # None after the policy's first action
     standing: bool = True  # before the first action, and after a stop until the next one
     last: np.ndarray | None = None  # the last action that was applied, (D,)
+    apply_s: deque[float] = field(default_factory=lambda: deque(maxlen=KEPT_TICKS))
 
     def drive(self, pacer: Pacer, seconds: float | None, until: Callable[[], bool]) -> None:
         """Run ticks until the policy, `until`, a mark or the time ends it; the report gets the timing in any case."""
@@ -416,6 +434,7 @@ class _Run:
         finally:
             self.report.jitter = jitter(pacer.late_s, pacer.missed, pacer.ticks)
             if work_s:
+                self.report.apply_p50_ms = float(np.median(self.apply_s)) * 1e3
                 self.report.work_p50_ms = float(np.median(work_s)) * 1e3
                 self.report.work_p99_ms = float(np.quantile(work_s, 0.99)) * 1e3
 
@@ -468,7 +487,9 @@ class _Run:
         if self.agent.check is not self.guard:  # else it was checked before `act` returned
             action = self.guard(action, self.guard.reference(obs, self.last) if self.standing else self.last)
         self.standing, self.last = False, action
+        began_s = time.perf_counter()
         self.robot.apply(action)
+        self.apply_s.append(time.perf_counter() - began_s)
         return action
 
 
