@@ -135,7 +135,7 @@ def deadlines_begin_anew(replica: Replica) -> None:
 def forget_episodes(replica: Replica) -> None:
     """An act without a step is for whatever episode its session is in when the policy is free."""
     replica.engine._episode_of = lambda *_: None  # type: ignore[method-assign,return-value]
-    replica.engine._can_act_on = lambda *_: True  # type: ignore[method-assign]
+    replica.engine._user_of = lambda pending, *_: pending.origin  # type: ignore[method-assign]
 
 
 def outlive_connections(replica: Replica) -> None:

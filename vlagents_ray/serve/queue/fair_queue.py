@@ -158,7 +158,7 @@ class FairQueue:
             if pending.loaded is None:  # otherwise it must run, to release the checkpoint that its session holds
                 if pending.over:
                     continue
-                if pending.origin.ended or pending.expired(now):
+                if pending.is_useless(now):
                     expired.append(pending)
                     continue
             pending.begun = True

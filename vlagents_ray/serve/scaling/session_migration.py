@@ -33,7 +33,7 @@ from vlagents_ray.errors import VLAgentsError
 from vlagents_ray.protocol.messages import Op, Reply, Request
 from vlagents_ray.serve.engine.engine import Engine
 from vlagents_ray.serve.engine.sender import settle
-from vlagents_ray.serve.requests import PendingRequest
+from vlagents_ray.serve.requests import NOWHERE, Origin, PendingRequest
 from vlagents_ray.serve.sessions import Outdated, Version
 
 logger = logging.getLogger(__name__)
@@ -48,7 +48,7 @@ T = TypeVar("T")
 InThread = Callable[..., Awaitable[Any]]
 Spawn = Callable[[Coroutine[Any, Any, Any]], "asyncio.Task[Any]"]
 FetchFrom = Callable[[str, str], Awaitable[bool]]  # fetches a session from the replica of that name
-Fits = Callable[[dict[str, Any], float], bool]  # whether a request can use a session: its state, and its begin
+UserOf = Callable[[dict[str, Any], float], Origin | None]
 _PENDING = 4096  # largest number of concurrent searches of a caller; further requests get `UnknownSession` at once
 _ANSWER_S = 3.0  # time limit for another replica's answer; a replica that still loads does not answer
 _OTHERS_S = 0.3  # time limit for the remaining answers, once a replica has answered that it holds the session
@@ -94,8 +94,8 @@ class HeldSessions:
     async def copy(self, session_id: str, offered: bool = False) -> dict[str, Any] | None:
         """Return the session's state after its queued acts; None if it is not here, or cannot be pickled.
 
-        Its `age_s` is as of the call, not of the answer. `offered` is for the replica that `send_to_peer` called: there
-        is no time limit, since the session ends with this replica otherwise.
+        Its `age_s` is the time from its episode's reset to this call, s. `offered` is for the replica that
+        `send_to_peer` called: there is no time limit, since the session ends with this replica otherwise.
         """
         asked = self._engine.clock()
         if session_id in self._leaving and not offered:
@@ -105,7 +105,7 @@ class HeldSessions:
             await asyncio.sleep(ON_ITS_WAY_S)
         state = await self._ask(session_id, "export", None if offered else EXPORT_S)
         if state is not None:
-            state["age_s"] -= self._engine.clock() - asked
+            state["age_s"] = asked - state.pop("began")
         return state
 
     async def release(self, session_id: str, version: Version, claim: str) -> bool:
@@ -239,7 +239,7 @@ class SessionMigrator:
         self._loop = loop
         self._closed = False
         self._lock = threading.Lock()
-        self._callbacks: dict[str, list[tuple[Callable[[], None], Fits]]] = {}  # by session, until its search is over
+        self._callbacks: dict[str, list[tuple[Callable[[], None], UserOf]]] = {}  # by session, until its search is over
         self._next_query: dict[str, asyncio.Future[_Answers]] = {}  # sessions of the next query
         self._callers: Counter[str] = Counter()  # number of running searches by caller
         self._unannounced: dict[str, int] = {}  # steps of begun episodes that are not announced yet, by session
@@ -252,14 +252,16 @@ class SessionMigrator:
         self._engine = engine
         self.held = HeldSessions(engine, self._loop, self._name, self._fetch_from, self._spawn)
 
-    def fetch(self, session_id: str, then: Callable[[], None], caller: str = "", fits: Fits = lambda *_: True) -> bool:
+    def fetch(
+        self, session_id: str, then: Callable[[], None], caller: str = "", user: UserOf = lambda *_: NOWHERE
+    ) -> bool:
         """Fetch a session from another replica.
 
         Args:
             then: Called once the session is here or was not found.
             caller: Owner of the search; the number of concurrent searches per caller is limited.
-            fits: Returns whether a session with that exported state, whose episode began at that time, is of use. A
-                session that no caller can use is not moved.
+            user: Returns the origin of a request that can act on a session with that exported state, whose episode
+                began at that time. A session for which all return None is not moved.
 
         Returns:
             False if `then` will not be called, since `caller` has too many searches or the migrator is closed.
@@ -277,9 +279,9 @@ class SessionMigrator:
                 then()
 
             if session_id in self._callbacks:
-                self._callbacks[session_id].append((finished, fits))
+                self._callbacks[session_id].append((finished, user))
                 return True
-            self._callbacks[session_id] = [(finished, fits)]
+            self._callbacks[session_id] = [(finished, user)]
         self._loop.call_soon_threadsafe(lambda: self._spawn(self._search(session_id)))
         return True
 
@@ -379,16 +381,17 @@ class SessionMigrator:
         # The other replica received the call later than `asked`, so that this is no later than the episode's true
         # begin: an act that arrived after the reset is never taken for one of an older episode.
         began = asked - state["age_s"]
-        if not (offered or self._is_of_use(session_id, state, began)):
+        origin = NOWHERE if offered else self._user_of(session_id, state, began)
+        if origin is None:
             return True
-        arriving = await self._in_thread(self._engine.prepare_adoption, session_id, state, _LOAD_S, began)
+        arriving = await self._in_thread(self._engine.prepare_adoption, session_id, state, _LOAD_S, began, origin)
         version = state["steps"], state["moves"]
         release = self._spawn(self._answer(peer.ask(HeldSessions.release, session_id, version, uuid.uuid4().hex)))
         while not (await asyncio.wait([release], timeout=_ANSWER_S))[0]:
             if await self._query_peer(peer, []) is None:  # the replica hangs: only the copy waits for it
                 self._finish(session_id)
         if not release.result():
-            self._engine.models.release(arriving)
+            self._engine.abandon(arriving)
             return False
         self._engine.enter(arriving)
         logger.info(
@@ -396,10 +399,12 @@ class SessionMigrator:
         )
         return True
 
-    def _is_of_use(self, session_id: str, state: dict[str, Any], began: float) -> bool:
+    def _user_of(self, session_id: str, state: dict[str, Any], began: float) -> Origin | None:
+        """Return the origin of a waiting request that can act on the session; None if there is no such request."""
         with self._lock:
             callbacks = list(self._callbacks.get(session_id, ()))
-        return any(fits(state, began) for _, fits in callbacks)
+        origins = (user(state, began) for _, user in callbacks)
+        return next((origin for origin in origins if origin is not None), None)
 
     def _answers(self, session_id: str) -> asyncio.Future[_Answers]:
         """Return a future of the other replicas' answers to one query about all sessions that are being searched."""

@@ -16,7 +16,7 @@ from typing import Any, Protocol, TypeVar
 
 from vlagents_ray.errors import InvalidInput, InvalidWeights, PolicyUnavailable, VLAgentsError
 from vlagents_ray.serve.scaling.session_migration import PeerEnded, PeerUnreachable
-from vlagents_ray.serve.weights import NewestVersion, PushOptions, PushResult, Rest, WeightUpdates
+from vlagents_ray.serve.weights import NewestVersion, PushMode, PushOptions, PushResult, Rest, WeightUpdates
 from vlagents_ray.weights.shared_values import NotShared, SharedValues
 
 T = TypeVar("T")
@@ -148,9 +148,12 @@ class WeightPusher:
                     best, source = newest, replica
             if source is None:
                 return
+            last = own.number
             for version in await source.weights(WeightUpdates.held):
                 if version.number > own.number:
-                    options = PushOptions(allow_same=True, pin=version.pinned)
+                    mode: PushMode = "keep" if last < version.kept <= version.number else "next_episode"
+                    last = version.number
+                    options = PushOptions(mode=mode, allow_same=True, pin=version.pinned)
                     await self._own.weights(WeightUpdates.stage, version.number, version.values, options)
                     await self._own.weights(WeightUpdates.commit, version.number, options)
             logger.info("took version %d of the weights from %s", best.number, source.name)
