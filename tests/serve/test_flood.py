@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
+import os
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from pathlib import Path
 
 import flood
 import pytest
+from eval_fakes import wait_for
 
 from benchmarks.processes import cpu_seconds
 from vlagents_ray.client.transports.shm import ShmTransport
@@ -15,6 +19,7 @@ from vlagents_ray.client.transports.shm import ShmTransport
 pytestmark = [pytest.mark.alone, pytest.mark.slow, pytest.mark.integration]
 
 SECONDS = 3.0
+MEMORY_MB = 150  # what eight connections of one key may take: for each, a part of a message and what uvicorn copies
 ATTEMPTS = 3  # a machine that does something else meanwhile misleads
 NOISE_MS = 5.0  # of p90 on a machine with two cores, of which the flooding process takes one while it begins
 CASES = [
@@ -69,3 +74,75 @@ def test_a_robots_act_takes_less_than_twice_as_long(
         if p50[1] < 2 * p50[0] and p90[1] < 2 * max(p90[0], NOISE_MS):
             return
     raise AssertionError(f"alone and beside the flood, ms: p50 and p90 of {found}")
+
+
+def resources(server: int) -> tuple[float, int]:
+    """The memory of a process, MB, and the number of its sockets."""
+    [memory] = [line for line in Path(f"/proc/{server}/status").read_text().splitlines() if line.startswith("VmRSS")]
+    files = []
+    for file in Path(f"/proc/{server}/fd").iterdir():
+        with contextlib.suppress(OSError):  # closed meanwhile
+            files.append(os.readlink(file))
+    return int(memory.split()[1]) / 1024, sum(file.startswith("socket:") for file in files)
+
+
+# uvicorn's port is behind HAProxy, which bounds the connections without headers (`launch/test_haproxy.py`).
+TABLE = [
+    *(("own port", behaviour) for behaviour in flood.BEHAVIOURS),
+    *(
+        ("WS /v1/stream", behaviour)
+        for behaviour in flood.BEHAVIOURS
+        if behaviour not in ("nothing", "half a handshake")
+    ),
+    *(
+        (way, behaviour)
+        for way in flood.WEBSOCKETS
+        if way not in ("own port", "WS /v1/stream")
+        for behaviour in ("half a message", "pings", "fragments", "compressed messages")
+    ),
+]
+
+
+@pytest.mark.parametrize(("way", "behaviour"), TABLE)
+def test_no_behaviour_of_a_connection_delays_a_robot_or_leaves_anything(
+    where: flood.Where, robot: ShmTransport, way: str, behaviour: str, record_property: Callable[[str, object], None]
+) -> None:
+    """One key of rate 1, or nobody's, with eight connections."""
+    memory, sockets = resources(where["pid"])
+    for attempt in range(ATTEMPTS):
+        alone = flood.acts_ms(robot, 1.0)
+        with flood.child("attack", way, behaviour, json.dumps(where), "8", "60") as attacker:
+            assert attacker.stdout.readline() == "begun\n"
+            beside = flood.acts_ms(robot, 1.5)
+            held = resources(where["pid"])[0] - memory
+        p50, p90, p99 = ((flood.percentile(alone, n), flood.percentile(beside, n)) for n in (50, 90, 99))
+        is_calm = p50[1] < 2 * p50[0] and p90[1] < 2 * max(p90[0], NOISE_MS)
+        if is_calm or attempt == ATTEMPTS - 1:
+            break
+    begun = time.monotonic()
+    wait_for(lambda: resources(where["pid"])[1] <= sockets, 30)
+    ended_s = time.monotonic() - begun
+    row = (
+        f"p50 {p50[0]:.2f} -> {p50[1]:.2f} ms, p90 {p90[0]:.2f} -> {p90[1]:.2f} ms, p99 {p99[0]:.2f} -> {p99[1]:.2f} ms"
+    )
+    row += f", memory +{held:.0f} MB, connections gone after {ended_s:.1f} s"
+    record_property("row", row)
+    print(f"ROW {way} | {behaviour} | {row}")
+    assert is_calm, row
+    assert held < MEMORY_MB, row
+
+
+@pytest.mark.parametrize("way", flood.WEBSOCKETS)
+def test_no_websocket_is_compressed(where: flood.Where, way: str) -> None:
+    with flood.opened(flood.WEBSOCKETS[way], where, "robot") as (_, answer):
+        assert b" 101 " in answer
+        assert b"extensions" not in answer.lower()
+
+
+@pytest.mark.parametrize("way", flood.WEBSOCKETS)
+@pytest.mark.parametrize("behaviour", ["half a head", "half a message", flood.DRIPPED])
+def test_a_message_that_does_not_arrive_ends_its_connection(where: flood.Where, way: str, behaviour: str) -> None:
+    begun = time.monotonic()
+    with contextlib.suppress(OSError):
+        flood.misbehave(flood.WEBSOCKETS[way], behaviour, where, "robot", begun + 10 * flood.SLOW_S)
+    assert time.monotonic() - begun < 5 * flood.SLOW_S

@@ -78,7 +78,7 @@ from vlagents_ray.serve.dialects import gr00t
 from vlagents_ray.serve.dialects.base import GatewayContext
 from vlagents_ray.serve.endpoints.shm import ShmServer, UnixConnection
 from vlagents_ray.serve.endpoints.websocket import WebSocketServer
-from vlagents_ray.serve.engine.admission import Admission, MessageAdmission, NeedsDecodingThread
+from vlagents_ray.serve.engine.admission import Admission, ArrivingBytes, MessageAdmission, NeedsDecodingThread
 from vlagents_ray.serve.engine.engine import Engine
 from vlagents_ray.serve.engine.sender import REFUSALS
 from vlagents_ray.wire import gr00t as gr00t_codec
@@ -365,6 +365,48 @@ def test_robots_have_a_share_of_the_memory_for_themselves() -> None:
     assert isinstance(answer, Reply)
     assert isinstance(answer.error, MessageTooLarge), "it is not told to wait"
     assert "limits.in_flight_bytes" in str(answer.error)
+
+
+def test_a_key_takes_half_of_what_other_keys_leave_free() -> None:
+    whole = Admission(8 * DECODED)
+
+    def message(key: str) -> tuple[MessageAdmission, VLAgentsError | None]:
+        one = MessageAdmission(whole, DEFAULT_LIMITS, lambda _: True, key=key)
+        [answer] = read_requests(frame(reset()), one)
+        return one, answer.error if isinstance(answer, Reply) else None
+
+    of_one = [message("one") for _ in range(5)]
+    assert [type(error) for _, error in of_one] == [type(None)] * 4 + [Overloaded]
+    of_other = [message("other") for _ in range(3)]
+    assert [type(error) for _, error in of_other] == [type(None)] * 2 + [Overloaded]
+    assert message("third")[1] is None
+    for one, _ in of_one + of_other:
+        one.release()
+    assert whole.held == 0
+    assert not whole._held_by
+
+
+def test_incomplete_messages_give_way_to_a_complete_one() -> None:
+    whole = Admission(100)
+    given_up: list[str] = []
+
+    def arriving(name: str, key: str | None, size: int) -> ArrivingBytes:
+        one = ArrivingBytes(whole, key, True, lambda: given_up.append(name))
+        one.resize(size)
+        return one
+
+    held = [arriving("a", "flood", 30), arriving("b", "flood", 20), arriving("c", None, 40)]
+    whole.hold(20, True, 0, "robot")
+    assert given_up == ["a"]
+    with pytest.raises(Overloaded):
+        held[0].resize(80)
+    with pytest.raises(Overloaded):  # a simulation takes nothing from robots
+        whole.hold(30, False, 0)
+    assert given_up == ["a"]
+    whole.release(20, "robot")
+    for one in held:
+        one.release()
+    assert whole.held == 0
 
 
 def test_how_long_to_wait_travels_with_the_refusal() -> None:

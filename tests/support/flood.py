@@ -16,6 +16,7 @@ import subprocess
 import sys
 import threading
 import time
+import zlib
 from collections.abc import Callable, Iterator
 from dataclasses import asdict
 from functools import cache, partial
@@ -27,6 +28,7 @@ import numpy as np
 from asgi_server import served
 from dialect_server import ALL, METADATA
 from websockets.client import ClientProtocol
+from websockets.extensions.permessage_deflate import ClientPerMessageDeflateFactory
 from websockets.protocol import State
 from websockets.uri import parse_uri
 
@@ -37,10 +39,12 @@ from vlagents_ray.interface import Act, Agent, Obs
 from vlagents_ray.protocol import frame_layout
 from vlagents_ray.protocol.frames import CONTENT_TYPE
 from vlagents_ray.protocol.messages import Limits, LocalAddress, Request
+from vlagents_ray.protocol.websocket_frames import frame_head
 from vlagents_ray.serve.access.api_keys import Keys
 from vlagents_ray.serve.config.dialects import DialectArgs
 from vlagents_ray.serve.dialects.base import ReplicaContext, dialect_routes
 from vlagents_ray.serve.endpoints.access_middleware import AccessMiddleware
+from vlagents_ray.serve.endpoints.front import FrontMiddleware
 from vlagents_ray.serve.endpoints.http import build_http_app
 from vlagents_ray.serve.endpoints.shm import ShmServer
 from vlagents_ray.serve.endpoints.websocket import WebSocketServer
@@ -51,6 +55,7 @@ from vlagents_ray.wire import vla_eval as vla_eval_codec
 
 HEIGHT, WIDTH = 2304, 4096  # of the largest image
 IMAGES = 4  # of these in the largest request
+SLOW_S = 6.0  # time in which a message must arrive
 UNIX = socket.AF_UNIX, socket.SOCK_SEQPACKET
 
 
@@ -74,11 +79,15 @@ def serve() -> None:
     keys = Keys.from_text(json.dumps({"keys": [_key("robot"), *rated]}))
     admit, limits = partial(keys.check, app="app"), Limits()
     engine = Engine(_Policy())
-    own, near = WebSocketServer(engine, limits, "127.0.0.1", None, admit), ShmServer(engine, limits, admit)
+    own = WebSocketServer(engine, limits, "127.0.0.1", None, admit, slow_s=SLOW_S)
+    near = ShmServer(engine, limits, admit)
     own.open(), near.open()
     engine.start()
     routes = dialect_routes(DialectArgs(**ALL), ReplicaContext(engine, lambda: METADATA, limits))
-    with served(AccessMiddleware(build_http_app(engine, lambda: METADATA, limits, more=routes), keys, "app")) as port:
+    inside = build_http_app(engine, lambda: METADATA, limits, more=routes)
+    with served(
+        FrontMiddleware(AccessMiddleware(inside, keys, "app", slow_s=SLOW_S, admission=engine.admission))
+    ) as port:
         found = {"port": port, "own": [own.address.port, own.path], "local": asdict(near.address)}
         print(json.dumps(found), flush=True)
         sys.stdin.read()
@@ -180,20 +189,44 @@ def _drain(connection: socket.socket) -> None:
             pass
 
 
+def address_of(path: str, where: Where) -> tuple[int, str]:
+    """The port and the path of a WebSocket; "own" is that of the replica's own port."""
+    return (where["own"][0], where["own"][1]) if path == "own" else (where["port"], path)
+
+
+@contextlib.contextmanager
+def connected(path: str, where: Where) -> Iterator[socket.socket]:
+    """A connection before its handshake."""
+    with socket.create_connection(("127.0.0.1", address_of(path, where)[0]), timeout=5) as connection:
+        yield connection
+
+
+@contextlib.contextmanager
+def opened(path: str, where: Where, key: str) -> Iterator[tuple[socket.socket, bytes]]:
+    """A WebSocket, which offers compression, and the answer to its handshake; `OSError` if it is refused."""
+    port, place = address_of(path, where)
+    with connected(path, where) as connection:
+        protocol = ClientProtocol(
+            parse_uri(f"ws://127.0.0.1:{port}{place}"),
+            extensions=[ClientPerMessageDeflateFactory(client_max_window_bits=True)],
+        )
+        request = protocol.connect()
+        request.headers["authorization"] = f"Bearer {key}"
+        protocol.send_request(request)
+        connection.sendall(b"".join(protocol.data_to_send()))
+        answered = b""
+        while protocol.state is State.CONNECTING and (answer := connection.recv(65536)):
+            protocol.receive_data(answer)
+            answered += answer
+        if protocol.state is not State.OPEN:
+            raise ConnectionRefusedError(answered[:100])
+        yield connection, answered
+
+
 def _websocket(path: str) -> Attack:
     def attack(message: bytes, where: Where, key: str, end: float) -> None:
-        port, place = (where["own"][0], where["own"][1]) if path == "own" else (where["port"], path)
         head = bytes([0x82, 0x80 | 127]) + struct.pack(">Q", len(message)) + bytes(4)  # a mask of zeros
-        with socket.create_connection(("127.0.0.1", port), timeout=5) as connection:
-            protocol = ClientProtocol(parse_uri(f"ws://127.0.0.1:{port}{place}"))
-            request = protocol.connect()
-            request.headers["authorization"] = f"Bearer {key}"
-            protocol.send_request(request)
-            connection.sendall(b"".join(protocol.data_to_send()))
-            while protocol.state is State.CONNECTING and (answer := connection.recv(65536)):
-                protocol.receive_data(answer)
-            if protocol.state is not State.OPEN:
-                return
+        with opened(path, where, key) as (connection, _):
             threading.Thread(target=_drain, args=(connection,), daemon=True).start()
             while (left_s := end - time.monotonic()) > 0:
                 connection.settimeout(left_s)
@@ -271,15 +304,89 @@ PARTS: dict[str, Callable[[], bytes]] = {
 FRAMES = ("own port", "WS /v1/stream", "POST /v1/reset, frame", "shared memory")  # the ways that take a frame
 
 
+def _masked(first: int, payload: bytes = b"") -> bytes:
+    """A client's frame with this first byte, and a mask of zeros."""
+    return bytes([first]) + frame_head(len(payload), bytes(4))[1:] + payload
+
+
+def _bomb() -> bytes:
+    """A compressed message: 16 kB of 16 MiB."""
+    compressor = zlib.compressobj(9, zlib.DEFLATED, -12)
+    return (compressor.compress(bytes(16 * 2**20 - 64)) + compressor.flush(zlib.Z_SYNC_FLUSH))[:-4]
+
+
+HANDSHAKE = b"GET / HTTP/1.1\r\nHost: 127.0.0.1\r\nUpgrade: websocket\r\n"
+PART_OF_A_MESSAGE = frame_head(15 * 2**20, bytes(4)) + bytes(2 * 2**20)
+# What a client sends before it shows a key, and whether it then waits.
+BEFORE_A_KEY: dict[str, tuple[bytes, bool]] = {
+    "nothing": (b"", True),
+    "half a handshake": (HANDSHAKE, True),
+    "a refused handshake": (HANDSHAKE + b"Connection: Upgrade\r\n" + b"a: b\r\n" * 2000 + b"\r\n", False),
+    "closed at once": (b"", False),
+}
+# What it sends with a key: once, and then it waits; or repeatedly.
+ONCE: dict[str, bytes] = {"half a head": b"\x82", "half a message": PART_OF_A_MESSAGE}
+REPEATED: dict[str, Callable[[], bytes]] = {
+    "pings": lambda: _masked(0x89),
+    "pongs": lambda: _masked(0x8A),
+    "closes": lambda: _masked(0x88),
+    "empty messages": lambda: _masked(0x82),
+    "empty texts": lambda: _masked(0x81),
+    "fragments": lambda: _masked(0x02) + _masked(0x00) * 100,
+    "reserved opcodes": lambda: _masked(0x83),
+    "reserved bits": lambda: _masked(0xF2),
+    "compressed messages": lambda: _masked(0xC2, _bomb()),
+}
+DRIPPED = "a message byte by byte"
+BEHAVIOURS = [*BEFORE_A_KEY, *ONCE, DRIPPED, *REPEATED]
+WEBSOCKETS = {way: way.removeprefix("WS ") for way in WAYS if way.startswith("WS ") and "probes" not in way}
+WEBSOCKETS["own port"] = "own"
+
+
+def misbehave(path: str, behaviour: str, where: Where, key: str, end: float) -> None:
+    """Behave in that way over one connection, until the server ends it, or until the `end`."""
+    if behaviour in BEFORE_A_KEY:
+        data, waits = BEFORE_A_KEY[behaviour]
+        with connected(path, where) as connection:
+            connection.sendall(data)
+            if waits:
+                connection.settimeout(max(0.01, end - time.monotonic()))
+                connection.recv(1)
+            elif data:
+                connection.recv(100)
+        return
+    with opened(path, where, key) as (connection, _):
+        connection.settimeout(max(0.01, end - time.monotonic()))
+        if behaviour == DRIPPED:
+            connection.sendall(frame_head(2**20, bytes(4)))
+            threading.Thread(target=_drain, args=(connection,), daemon=True).start()
+            while time.monotonic() < end:
+                connection.sendall(b"x")
+                time.sleep(0.05)
+        elif behaviour in ONCE:
+            connection.sendall(ONCE[behaviour])
+            _drain(connection)
+        else:
+            frame = REPEATED[behaviour]()
+            payload = frame * max(1, 2**18 // len(frame))
+            threading.Thread(target=_drain, args=(connection,), daemon=True).start()
+            while time.monotonic() < end:
+                connection.sendall(payload)
+
+
 def attack(way: str, part: str, where: Where, connections: int, seconds: float) -> None:
-    """Send the largest messages for so long, as fast as they are taken, whatever is answered."""
+    """Send the largest messages, or misbehave, for so long, as fast as bytes are taken, whatever is answered."""
     make, send = WAYS[way]
-    message, end = PARTS.get(part, make)(), time.monotonic() + seconds
+    end = time.monotonic() + seconds
+    message = b"" if part in BEHAVIOURS else PARTS.get(part, make)()
 
     def flood() -> None:
         while time.monotonic() < end:
             with contextlib.suppress(OSError):  # cut off: once more
-                send(message, where, key_of(way), end)
+                if part in BEHAVIOURS:
+                    misbehave(WEBSOCKETS[way], part, where, key_of(way), end)
+                else:
+                    send(message, where, key_of(way), end)
             time.sleep(0.001)
 
     threads = [threading.Thread(target=flood, daemon=True) for _ in range(connections)]

@@ -20,6 +20,8 @@ from vlagents_ray.protocol.messages import REQUEST_ID_HEADER
 from vlagents_ray.serve.access.api_keys import Caller, Identity, Keys, NoKey, on_behalf_of, token_of
 from vlagents_ray.serve.access.origin_check import require_own_page
 from vlagents_ray.serve.endpoints.http_messages import headers_of, named, problem_response
+from vlagents_ray.serve.endpoints.incoming_frames import SCOPE_KEY, IncomingFrames
+from vlagents_ray.serve.engine.admission import Admission
 from vlagents_ray.serve.engine.pauses import note_connection
 
 logger = logging.getLogger(__name__)
@@ -44,6 +46,7 @@ class AccessMiddleware:
         slow_s: float = 30.0,
         idle_s: float = 600.0,
         hosts: Collection[str] = (),
+        admission: Admission | None = None,
     ) -> None:
         """Protect `app`.
 
@@ -52,7 +55,9 @@ class AccessMiddleware:
             slow_s: Maximum time that a request may take to arrive, or a WebSocket's client to accept a message, s.
             idle_s: Maximum time that a WebSocket may be silent, s.
             hosts: Further host names of the server, see `require_own_page`.
+            admission: The memory in flight of the replica, which also counts incomplete messages of WebSockets.
         """
+        self._admission = admission
         self._app, self._keys, self._name = app, keys, name
         self._hosts, self._slow_s, self._idle_s = hosts, slow_s, idle_s
 
@@ -86,7 +91,7 @@ class AccessMiddleware:
         with on_behalf_of(caller):
             if scope["type"] == "websocket":
                 try:
-                    await _TimedWebSocket(caller, self._slow_s, self._idle_s, receive, send).run(self._app, scope)
+                    await self._run_websocket(caller, scope, receive, send)
                 finally:
                     if isinstance(caller, Caller):
                         caller.hold(-1)
@@ -94,6 +99,13 @@ class AccessMiddleware:
                 await _run_upload(self._app, scope, receive, send, self._slow_s)
             else:
                 await self._app(scope, receive, send)
+
+    async def _run_websocket(self, caller: Identity, scope: Scope, receive: Receive, send: Send) -> None:
+        frames: IncomingFrames | None = scope.get(SCOPE_KEY)
+        if frames is not None:
+            frames.supervise(caller, self._admission)
+        socket = _TimedWebSocket(caller, self._slow_s, self._idle_s, receive, send, frames)
+        await socket.run(self._app, scope)
 
 
 def _is_public(scope: Scope) -> bool:
@@ -166,7 +178,16 @@ async def _run_upload(app: ASGIApp, scope: Scope, receive: Receive, send: Send, 
 class _TimedWebSocket:
     """A WebSocket that ends when its key becomes invalid, or its client is silent or does not read replies."""
 
-    def __init__(self, caller: Identity, slow_s: float, idle_s: float, receive: Receive, send: Send) -> None:
+    def __init__(
+        self,
+        caller: Identity,
+        slow_s: float,
+        idle_s: float,
+        receive: Receive,
+        send: Send,
+        frames: IncomingFrames | None,
+    ) -> None:
+        self._frames = frames
         self._caller, self._slow_s, self._idle_s = caller, slow_s, idle_s
         self._receive, self._send = receive, send
         self._loop = asyncio.get_running_loop()
@@ -204,6 +225,8 @@ class _TimedWebSocket:
         self._silent_since = self._loop.time()
         message = await self._receive()
         self._silent_since = None
+        if self._frames is not None and message["type"] == "websocket.receive":
+            self._frames.taken()
         return message
 
     async def _timed_send(self, message: Message) -> None:
@@ -215,6 +238,8 @@ class _TimedWebSocket:
         now = self._loop.time()
         if self._sending_since is not None and now - self._sending_since > self._slow_s:
             return _POLICY_VIOLATION, "replies are not taken"
+        if self._frames is not None and self._frames.arriving_s > self._slow_s:
+            return _POLICY_VIOLATION, f"a message took longer than {self._slow_s:g} s"
         if self._silent_since is not None and now - self._silent_since > self._idle_s:
             return _GOING_AWAY, "silent for too long"
         if isinstance(self._caller, Caller) and (reason := self._caller.refusal()) is not None:

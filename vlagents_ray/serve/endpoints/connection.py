@@ -12,6 +12,7 @@ import errno
 import fcntl
 import logging
 import os
+import select
 import socket
 import struct
 import termios
@@ -39,7 +40,7 @@ logger = logging.getLogger(__name__)
 
 BACKLOG = 128
 MOST_UNANSWERED = 256  # unanswered messages of a client; further ones stay unread in its connection
-POLICY_VIOLATION, _INTERNAL_ERROR = 1008, 1011  # WebSocket close codes
+POLICY_VIOLATION, INTERNAL_ERROR = 1008, 1011  # WebSocket close codes
 # Maximum number of connections that a server accepts in a second; each takes some time of the policy's thread.
 _ACCEPTED_PER_S = 200.0
 # Reasons for not polling a connection.
@@ -91,7 +92,10 @@ class PolledConnection(ABC):
 
     @abstractmethod
     def _write(self, message: Message) -> None:
-        """Send and record the answers of a message."""
+        """Send and record the answers of a message, on the thread of the last one.
+
+        An unexpected error ends this connection, and nothing else.
+        """
 
     @abstractmethod
     def _discard(self) -> None:
@@ -107,8 +111,12 @@ class PolledConnection(ABC):
             self._poller.watch(self._connection, self.ready)
 
     def ready(self) -> None:
-        """Read the connection; the batch queue calls this."""
-        self._run(self._read)
+        """Read the connection; the batch queue calls this. As `_run`, with one call less for each message."""
+        try:
+            self._read()
+        except Exception:
+            logger.exception("%s: disconnected a client after an error", self._name)
+            self.disconnect()
 
     def _run(self, callback: Callable[[], None]) -> None:
         """Run a callback of the poller; an unexpected error ends this connection, and nothing else."""
@@ -125,14 +133,6 @@ class PolledConnection(ABC):
     def _call_later(self, seconds: float, callback: Callable[[], None]) -> None:
         """Schedule a callback after `seconds`; call this on the polling thread."""
         self._poller.call_later(seconds, partial(self._run, callback))
-
-    def _answer(self, message: Message) -> None:
-        """Send the answers of a message, on the thread of the last one; an unexpected error ends this connection."""
-        try:
-            self._write(message)
-        except Exception:
-            logger.exception("%s: disconnects a client whose answers cannot be sent", self._name)
-            self.end("its answers cannot be sent", _INTERNAL_ERROR)
 
     def _pause(self, reason: str) -> None:
         """Stop polling the connection until `_resume` is called with the same reason."""
@@ -157,9 +157,18 @@ class PolledConnection(ABC):
 
     def _unthrottle(self) -> None:
         """Read the connection again, unless it has ended or its key has exceeded the rate again."""
-        self._unpolled_for.discard(THROTTLED)
-        if not self._ended and not self._is_throttled():
+        if self._may_read_again():
             self._continue()
+
+    def _may_read_again(self) -> bool:
+        """Return whether a pause for the rate of the key is over; disconnect a client that has hung up.
+
+        Its unread messages would be refused one by one, which delays the key's other connections.
+        """
+        self._unpolled_for.discard(THROTTLED)
+        if not self._ended and _has_hung_up(self._connection):
+            self.disconnect()
+        return not self._ended and not self._is_throttled()
 
     def _decode(
         self,
@@ -341,3 +350,10 @@ def has_unread(connection: socket.socket) -> bool:
     waiting = array("i", [0])
     fcntl.ioctl(connection, termios.FIONREAD, waiting)
     return waiting[0] > 0
+
+
+def _has_hung_up(connection: socket.socket) -> bool:
+    """Return whether the peer has closed its end; there may be unread messages."""
+    poller = select.poll()
+    poller.register(connection, getattr(select, "POLLRDHUP", 0))  # a full hang-up is reported in any case
+    return bool(poller.poll(0))

@@ -10,6 +10,7 @@ import contextlib
 import os
 import socket
 import time
+from functools import partial
 from typing import Any
 
 from starlette.middleware import Middleware
@@ -18,6 +19,7 @@ from starlette.types import ASGIApp, Message, Receive, Scope, Send
 from vlagents_ray.errors import MalformedMessage, shown
 from vlagents_ray.protocol.messages import STREAM_BYTES
 from vlagents_ray.serve.endpoints.http_messages import problem_response
+from vlagents_ray.serve.endpoints.incoming_frames import SCOPE_KEY, IncomingFrames
 
 _MESSAGE_TOO_BIG = 1009  # WebSocket close code
 _DRAINED_BYTES = 8 * STREAM_BYTES  # maximum number of bytes that are discarded after a message that was too large
@@ -30,7 +32,10 @@ def middlewares() -> list[Middleware]:
 
 
 class FrontMiddleware:
-    """Refuses headers that are not UTF-8, which Serve decodes, and lets clients read the reason for a code 1009."""
+    """Refuses headers that are not UTF-8, which Serve decodes; limits the frames of WebSockets, see `IncomingFrames`.
+
+    A client can read the reason for a close code, although it is still sending.
+    """
 
     def __init__(self, app: ASGIApp) -> None:
         self._app = app
@@ -57,7 +62,13 @@ class FrontMiddleware:
                 self._drain(receive)
             return message
 
-        await self._app(scope, received, send)
+        async def sent(message: Message) -> None:
+            await send(message)
+            if frames is not None and message["type"] == "websocket.accept":
+                frames.open()
+
+        frames = IncomingFrames.attach(receive, partial(self._drain, receive))
+        await self._app({**scope, SCOPE_KEY: frames}, received, sent)
 
     def _drain(self, receive: Receive) -> None:
         """Discard incoming bytes, since closing a socket with unread bytes resets the connection.

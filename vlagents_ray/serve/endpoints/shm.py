@@ -14,7 +14,6 @@ import logging
 import mmap
 import os
 import secrets
-import select
 import socket
 import struct
 import time
@@ -35,6 +34,7 @@ from vlagents_ray.serve.endpoints.connection import (
     BACKLOG,
     BACKLOGGED,
     DECODING,
+    INTERNAL_ERROR,
     MOST_UNANSWERED,
     POLICY_VIOLATION,
     STAMP_SPACE,
@@ -186,7 +186,7 @@ class UnixConnection(PolledConnection):
             sender.count_message()
         decoded = Decoded(self._reader.read(text, memory), {})
         message.decoded(decoded)
-        sender.send(message, decoded, self._answer, waited_s=waited_s)
+        sender.send(message, decoded, self._write, waited_s=waited_s)
 
     def _submit(
         self, sender: Sender, message: Message, admission: MessageAdmission, waited_s: float, decoded: Decoded
@@ -194,12 +194,7 @@ class UnixConnection(PolledConnection):
         message.decoded(decoded)
         if DECODING in self._unpolled_for:
             waited_s += time.perf_counter() - message.arrived
-        sender.send(message, decoded, self._answer, admission=admission, waited_s=waited_s)
-
-    def _unthrottle(self) -> None:
-        if not self._ended and _has_hung_up(self._connection):  # its messages are not decoded, which would delay others
-            self.disconnect()
-        super()._unthrottle()
+        sender.send(message, decoded, self._write, admission=admission, waited_s=waited_s)
 
     def _authenticate(self, message: bytes) -> Sender | None:
         """Read the key from the first message; if it is refused, check it again at each later message."""
@@ -224,8 +219,12 @@ class UnixConnection(PolledConnection):
         self._payload.free()
 
     def _write(self, message: Message) -> None:
-        self._send(*message.packed())
-        message.record()
+        try:
+            self._send(*message.packed())
+            message.record()
+        except Exception:
+            logger.exception("local client: its answers cannot be sent")
+            self.end("its answers cannot be sent", INTERNAL_ERROR)
 
     def _send(self, frame: bytes, compact_form: bool) -> None:
         flags = LocalAddress.COMPACT if compact_form else 0
@@ -350,10 +349,3 @@ def counted_array(admission: Admission, size: int, read: Callable[[], np.ndarray
     memory.flags.writeable = False
     weakref.finalize(memory, admission.release, size).atexit = False
     return memory
-
-
-def _has_hung_up(connection: socket.socket) -> bool:
-    """Return whether the peer has closed its end; there may be unread messages."""
-    poller = select.poll()
-    poller.register(connection, 0)  # reports a hang-up in any case
-    return bool(poller.poll(0))

@@ -52,6 +52,7 @@ from vlagents_ray.serve.endpoints.connection import (
     BACKLOG,
     BACKLOGGED,
     DECODING,
+    INTERNAL_ERROR,
     LEAST_WAIT_S,
     MOST_UNANSWERED,
     POLICY_VIOLATION,
@@ -64,7 +65,7 @@ from vlagents_ray.serve.endpoints.connection import (
     has_unread,
     time_in_socket_s,
 )
-from vlagents_ray.serve.engine.admission import MessageAdmission, image_bytes
+from vlagents_ray.serve.engine.admission import ArrivingBytes, MessageAdmission, image_bytes
 from vlagents_ray.serve.engine.engine import Engine
 from vlagents_ray.serve.engine.sender import REFUSED, Sender
 from vlagents_ray.serve.requests import Message
@@ -197,6 +198,7 @@ class WebSocketConnection(PolledConnection):
         # Received but unprocessed frames, their arrival times, s, and the admissions of those received in parts.
         self._frames: deque[tuple[Frame, float, MessageAdmission | None]] = deque()
         self._partial: MessageAdmission | None = None  # admission of a partly received message
+        self._arriving: ArrivingBytes | None = None  # its bytes
         self._unanswered = self._unanswered_bytes = 0  # messages; bytes with the decoded images
         self._messages = 0  # number received so far
         self._ending = False  # whether `end` was called, so that arriving bytes are ignored
@@ -286,6 +288,8 @@ class WebSocketConnection(PolledConnection):
                 self._messages += 1
                 self._frames.append((event, self._arrived, self._partial))
                 self._partial = None
+                if self._arriving is not None:
+                    self._arriving.release()
             elif self._control_frames.take(time.monotonic()) > 0:
                 self._charge_abuse()
                 self.end(f"more than {CONTROL_FRAMES} control frames at once")
@@ -316,7 +320,12 @@ class WebSocketConnection(PolledConnection):
                 admission = sender.admission(self._limits)
                 admission.begin_message()
                 self._partial = admission
-            self._partial.grow(self._received.size)
+            if self._arriving is None:
+                caller = self.caller if isinstance(self.caller, Caller) else None
+                is_robot = caller is None or caller.rank != "simulation"
+                key = None if caller is None else caller.name
+                self._arriving = ArrivingBytes(self._engine.admission, key, is_robot, self._give_up)
+            self._arriving.resize(self._received.size)
         except TooManyRequests:  # the rest stays unread until the key is under its rate
             self._is_throttled()
             if sender.refused_too_often:
@@ -324,12 +333,20 @@ class WebSocketConnection(PolledConnection):
         except VLAgentsError as error:
             self.end(str(error), _TRY_AGAIN_LATER if isinstance(error, Overloaded) else POLICY_VIOLATION)
 
+    def _give_up(self) -> None:
+        """End the connection, as a complete message needs the memory; called on any thread."""
+        self._call_soon(partial(self.end, "a complete message needs the memory", _TRY_AGAIN_LATER))
+
     def _is_backlogged(self) -> bool:
         """Return whether the client has too many unanswered messages or bytes; the caller holds the lock."""
         return self._unanswered >= MOST_UNANSWERED or self._unanswered_bytes > self._limits.body_bytes
 
     def _discard(self) -> None:
+        if not self._messages:  # a connection without a message costs as much as one
+            self._charge_abuse()
         self._partial = None
+        if self._arriving is not None:
+            self._arriving.release()
         self._received.discard()
         self._out.close()
 
@@ -413,8 +430,7 @@ class WebSocketConnection(PolledConnection):
             self._process(*self._frames.popleft())
 
     def _unthrottle(self) -> None:
-        self._unpolled_for.discard(THROTTLED)
-        if self._ended or self._is_throttled():
+        if not self._may_read_again():
             return
         if self._received.size and self._partial is None and self._sender is not None:
             self._hold_partial(self._sender)
@@ -480,10 +496,14 @@ class WebSocketConnection(PolledConnection):
             self._paused = self._paused and not resume
         if resume:
             self._call_soon(partial(self._resume, BACKLOGGED))
-        self._answer(message)
+        self._write(message)
 
     def _write(self, message: Message) -> None:
-        self._send(message.frame())
+        try:
+            self._send(message.frame())
+        except Exception:
+            logger.exception("stream client: its answers cannot be sent")
+            self.end("its answers cannot be sent", INTERNAL_ERROR)
 
     def _send(self, data: bytes) -> None:
         with self._sending:

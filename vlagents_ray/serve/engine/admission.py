@@ -17,6 +17,7 @@ import asyncio
 import contextlib
 import threading
 import weakref
+from collections import Counter
 from collections.abc import Callable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from typing import Any, TypeVar
@@ -32,6 +33,7 @@ INLINE_BYTES = 3 * 2**20
 INLINE_S = 8e-3
 REQUEST_BYTES = 2048  # memory of a request from its arrival until its answer, without images and arrays
 _ROBOTS_SHARE = 0.25  # share of the bytes in flight that is reserved for robots
+_KEYS_SHARE = 0.5  # share of the bytes that the other keys leave free, which one key may take
 
 
 class NeedsDecodingThread(Exception):
@@ -45,37 +47,107 @@ class Admission:
         self._limit = in_flight_bytes
         self.held = 0  # number of bytes in flight
         self.messages: dict[weakref.ref[Any], int] = {}  # bytes to release with each message that has no admission
+        self._held_by: Counter[str] = Counter()  # number of bytes in flight by the name of their key
+        self._arriving: dict[ArrivingBytes, int] = {}  # number of bytes of incomplete messages, the oldest first
+        self._arriving_by: Counter[str | None] = Counter()  # the same by the name of their key
         self._lock = threading.Lock()
         self._threads: dict[bool, ThreadPoolExecutor] = {}  # the thread pools for robots and (False) for others
         self._closed = False
 
-    def hold(self, size: int, robot: bool, message_bytes: int) -> None:
+    def hold(self, size: int, robot: bool, message_bytes: int, key: str | None = None) -> None:
         """Count `size` more bytes as in flight for a message that already holds `message_bytes` bytes.
+
+        If there is no room, incomplete messages are given up first.
+
+        Args:
+            robot: Whether the message may use the bytes reserved for robots.
+            key: The name of the sender's key, which may take a share of what other keys leave free; None without one.
 
         Raises:
             Overloaded: The bytes in flight leave no room at the moment.
             MessageTooLarge: The message alone exceeds the limit.
         """
-        most = self._limit if robot else int(self._limit * (1 - _ROBOTS_SHARE))
-        with self._lock:
-            if self.held + size <= most:
-                self.held += size
-                return
-            held = self.held
-        if message_bytes + size > most:
+        most = self._most(robot)
+        alone = most if key is None else int(most * _KEYS_SHARE)
+        if message_bytes + size > alone:
             raise MessageTooLarge(
-                f"message: takes {message_bytes + size} bytes, decoded, and all in flight may take {most}; send fewer "
+                f"message: takes {message_bytes + size} bytes, decoded, and all in flight may take {alone}; send fewer "
                 f"requests at once, or raise `limits.in_flight_bytes`"
             )
-        raise Overloaded(
-            f"the messages in flight here take {held} bytes, and may take {most}; send the request again after "
-            f"{Overloaded.retry_after_s:g} s, or raise `limits.in_flight_bytes`"
-        )
+        given_up: list[ArrivingBytes] = []
+        with self._lock:
+            while size > self._room(most, key) and (arriving := self._largest_arriving(size, most, robot, key)):
+                self._resize(arriving, 0)
+                given_up.append(arriving)
+            held, has_room = self.held, size <= self._room(most, key)
+            if has_room:
+                self._count(size, key)
+        for arriving in given_up:
+            arriving.give_up()
+        if not has_room:
+            raise Overloaded(
+                f"the messages in flight here take {held} bytes, and may take {most}, of which one key may take half "
+                f"of what other keys leave free; send the request again after {Overloaded.retry_after_s:g} s, or raise "
+                f"`limits.in_flight_bytes`"
+            )
 
-    def release(self, size: int) -> None:
+    def release(self, size: int, key: str | None = None) -> None:
         """Count `size` bytes as no longer in flight."""
         with self._lock:
-            self.held -= size
+            self._count(-size, key)
+
+    def resize(self, arriving: ArrivingBytes, size: int) -> None:
+        """Count `size` bytes of incomplete messages in place of those counted before; raise `Overloaded`."""
+        most = self._most(arriving.robot)
+        with self._lock:
+            more = size - self._arriving.get(arriving, 0)
+            has_room = more <= 0 or more <= self._room(most, arriving.key)
+            if has_room:
+                self._resize(arriving, size)
+        if not has_room:
+            raise Overloaded("the messages in flight leave no room for one that arrives slowly; send it again")
+
+    def _most(self, robot: bool) -> int:
+        return self._limit if robot else int(self._limit * (1 - _ROBOTS_SHARE))
+
+    def _room(self, most: int, key: str | None) -> int:
+        """Return how many bytes a sender may take; the caller holds the lock."""
+        room = most - self.held
+        return room if key is None else min(room, self._room_of_key(most, key))
+
+    def _room_of_key(self, most: int, key: str) -> int:
+        """Return how many bytes a key may take, if the incomplete messages of others give way."""
+        arriving_of_others = sum(self._arriving_by.values()) - self._arriving_by[key]
+        by_others = self.held - self._held_by[key] - arriving_of_others
+        return int(_KEYS_SHARE * (most - by_others)) - self._held_by[key]
+
+    def _largest_arriving(self, size: int, most: int, robot: bool, key: str | None) -> ArrivingBytes | None:
+        """Return incomplete messages to give up: of the key with most bytes, or of a key over its share.
+
+        None if there are none, or only those of robots and the bytes are for a simulation. The caller holds the lock.
+        """
+        candidates = [arriving for arriving in self._arriving if robot or not arriving.robot]
+        if key is not None and size > self._room_of_key(most, key):
+            candidates = [arriving for arriving in candidates if arriving.key == key]
+        return max(candidates, key=lambda arriving: self._held_by[arriving.key or ""], default=None)
+
+    def _resize(self, arriving: ArrivingBytes, size: int) -> None:
+        before = self._arriving.get(arriving, 0)
+        self._count(size - before, arriving.key)
+        self._arriving_by[arriving.key] += size - before
+        if not self._arriving_by[arriving.key]:
+            del self._arriving_by[arriving.key]
+        if size:
+            self._arriving[arriving] = size
+        else:
+            self._arriving.pop(arriving, None)
+
+    def _count(self, size: int, key: str | None) -> None:
+        self.held += size
+        if key is not None:
+            self._held_by[key] += size
+            if not self._held_by[key]:
+                del self._held_by[key]
 
     def release_with(self, message: weakref.ref[Any]) -> None:
         """Release the bytes of a message that is answered or dropped: the callback of the weak references to it."""
@@ -103,6 +175,29 @@ class Admission:
             each.shutdown(wait=False, cancel_futures=True)
 
 
+class ArrivingBytes:
+    """The bytes of a connection's messages that are incomplete, or not read by the application. Thread-safe."""
+
+    def __init__(self, admission: Admission, key: str | None, robot: bool, give_up: Callable[[], None]) -> None:
+        """Hold no bytes yet.
+
+        Args:
+            key: The name of the connection's key; None without one.
+            robot: Whether the bytes reserved for robots may be used.
+            give_up: Ends the connection, as a complete message needs the memory; called on any thread.
+        """
+        self.key, self.robot, self.give_up = key, robot, give_up
+        self._admission = admission
+
+    def resize(self, size: int) -> None:
+        """Count `size` bytes in place of those counted before; raise `Overloaded` if there is no room for more."""
+        self._admission.resize(self, size)
+
+    def release(self) -> None:
+        """Count no bytes any more."""
+        self._admission.resize(self, 0)
+
+
 class MessageAdmission(Budget):
     """The admission of one message, until the message is answered or dropped. Not thread-safe."""
 
@@ -114,6 +209,7 @@ class MessageAdmission(Budget):
         "_held",
         "_index",
         "_inline",
+        "_key",
         "_refusals",
         "_robot",
         "size",
@@ -129,6 +225,7 @@ class MessageAdmission(Budget):
         robot: bool = True,
         inline: bool = True,
         keep_files: bool = False,
+        key: str | None = None,
     ) -> None:
         """Create the admission of one message.
 
@@ -139,12 +236,13 @@ class MessageAdmission(Budget):
             robot: Whether the message may use the bytes reserved for robots.
             inline: Whether the first decoding thread also has other work, so that large messages are decoded elsewhere.
             keep_files: Whether `files` keeps the files of the message's images.
+            key: The name of the sender's key; None without one.
         """
         super().__init__(limits)
         self.files = {} if keep_files else None
         self._admission, self._admit = admission, admit
         self.size = size  # size of the message, until it is counted
-        self._robot = robot
+        self._robot, self._key = robot, key
         self._held = 0  # bytes counted as in flight
         self._decoded = 0  # decoded bytes among `_held`
         self._decoding_s = 0.0  # estimated time of decoding the images so far, s
@@ -184,7 +282,7 @@ class MessageAdmission(Budget):
 
     def receive(self, size: int) -> None:
         """Count bytes of the message itself as in flight; raise the errors of `Admission.hold`."""
-        self._admission.hold(size, self._robot, self._held)
+        self._admission.hold(size, self._robot, self._held, self._key)
         self._held += size
 
     def grow(self, size: int) -> None:
@@ -216,7 +314,7 @@ class MessageAdmission(Budget):
 
     def decode_on_thread(self, read: Callable[[Budget], T]) -> Future[T]:
         """Decode with `read` on a decoding thread, and return the future; raise `PolicyUnavailable` after `close`."""
-        self._admission.release(self._decoded)
+        self._admission.release(self._decoded, self._key)
         self._held -= self._decoded
         self._decoded = 0
         self._decoding_s = 0.0
@@ -238,7 +336,7 @@ class MessageAdmission(Budget):
         """Release the bytes of a message that is answered or dropped."""
         held, self._held, self._decoded = self._held, 0, 0
         if held:
-            self._admission.release(held)
+            self._admission.release(held, self._key)
 
     def __del__(self) -> None:
         self.release()

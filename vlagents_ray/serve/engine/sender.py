@@ -92,7 +92,9 @@ class Sender:
             free, counted = counted, False
             return self._count_message(caller) if op == "message" and not free else self._count(caller, op, free)
 
-        return MessageAdmission(self._engine.admission, limits, admit, size, robot=robot, keep_files=keep)
+        return MessageAdmission(
+            self._engine.admission, limits, admit, size, robot=robot, keep_files=keep, key=caller.name
+        )
 
     def count(self, requests: int) -> None:
         """Charge requests to the key before they are sent; raise `TooManyRequests` over its rate."""

@@ -42,12 +42,14 @@ from starlette.routing import BaseRoute, Route, WebSocketRoute
 from starlette.websockets import WebSocket, WebSocketDisconnect
 
 from vlagents_ray.errors import ConfigError, MalformedMessage, MessageTooLarge, Overloaded, VLAgentsError
+from vlagents_ray.page_protocol import PageProtocol
 from vlagents_ray.protocol.json_messages import problem
 from vlagents_ray.protocol.messages import is_loopback
 from vlagents_ray.serve.access.api_keys import Caller, Keys, ScopeCheck, caller_name, current_caller
 from vlagents_ray.serve.access.audit import log_pressed
 from vlagents_ray.serve.access.origin_check import require_same_origin
 from vlagents_ray.serve.endpoints.access_middleware import LIVE_PAGE, AccessMiddleware
+from vlagents_ray.serve.endpoints.front import FrontMiddleware
 from vlagents_ray.serve.endpoints.http_messages import answer_error, deny, html_response
 from vlagents_ray.serve.observers.live_view import Fleet
 
@@ -246,9 +248,15 @@ def page_server(
             f"live page: cannot listen on {host}:{port} ({error.strerror}); choose another port"
         ) from error
     routes, handlers = live_routes(fleet, open_to_network=False, videos=videos), {VLAgentsError: answer_error}
-    app = AccessMiddleware(Starlette(routes=routes, exception_handlers=handlers), keys, name)
+    app = FrontMiddleware(AccessMiddleware(Starlette(routes=routes, exception_handlers=handlers), keys, name))
     config = uvicorn.Config(
-        app, log_config=None, lifespan="off", ws="websockets-sansio", timeout_graceful_shutdown=_END_S
+        app,
+        log_config=None,
+        lifespan="off",
+        http=PageProtocol,
+        ws="websockets-sansio",
+        ws_per_message_deflate=False,
+        timeout_graceful_shutdown=_END_S,
     )
     server = uvicorn.Server(config)
     thread = threading.Thread(target=lambda: asyncio.run(server.serve([listening])), name="live-page", daemon=True)

@@ -202,7 +202,15 @@ class PolicyReplica(ClientApi, SiblingApi):
             *live_routes(self._fleet, open_to_network=insecure),
         ]
         inside = build_http_app(self._engine, self.metadata, self._limits, self._metadata_for_machine, more)
-        return AccessMiddleware(inside, self._keys, self._app, slow_s=slow_s, idle_s=idle_s, hosts=hosts)
+        return AccessMiddleware(
+            inside,
+            self._keys,
+            self._app,
+            slow_s=slow_s,
+            idle_s=idle_s,
+            hosts=hosts,
+            admission=self._engine.admission,
+        )
 
     def metadata(self) -> dict[str, Any]:
         """Return the document of `GET /v1/metadata` and `RemoteAgent.metadata`."""
