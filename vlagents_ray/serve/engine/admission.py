@@ -50,7 +50,8 @@ class Admission:
         self._held_by: Counter[str] = Counter()  # number of bytes in flight by the name of their key
         self._arriving: dict[ArrivingBytes, int] = {}  # number of bytes of incomplete messages, the oldest first
         self._arriving_by: Counter[str | None] = Counter()  # the same by the name of their key
-        self._lock = threading.Lock()
+        # Reentrant: the garbage collector may release a message within the sections that it guards.
+        self._lock = threading.RLock()
         self._threads: dict[bool, ThreadPoolExecutor] = {}  # the thread pools for robots and (False) for others
         self._closed = False
 
@@ -309,7 +310,7 @@ class MessageAdmission(Budget):
             try:
                 yield
             finally:
-                self._admission.release(scratch_bytes)
+                self._admission.release(scratch_bytes, self._key)
                 self._held -= scratch_bytes
 
     def decode_on_thread(self, read: Callable[[Budget], T]) -> Future[T]:
