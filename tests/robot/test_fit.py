@@ -112,7 +112,7 @@ def test_joints_in_another_order_than_that_of_the_policy_are_found_by_name() -> 
     policy = Contract(action=ActionSpec(dim=3, names=("lift.pos", "pan.pos", "gripper.pos")))
     with pytest.raises(ContractMismatch, match="number 0 is 'lift' of the policy and 'pan' of the env") as caught:
         require_match(policy, contract_of(Standing(0, 0)))
-    assert str(caught.value).count("\n- ") == 2
+    assert str(caught.value).count("- action.names: number") == 2
     require_match(Contract(action=ActionSpec(names=NAMES)), contract_of(Standing(0, 0)))
     require_match(policy, contract_of(Nameless()))
 
