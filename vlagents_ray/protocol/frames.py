@@ -43,6 +43,7 @@ from vlagents_ray.protocol.values import ValueReader, ValueWriter, is_number, re
 CONTENT_TYPE = "application/x-vlagents-frame"
 _OPTIONAL: dict[str, Any] = {"request_id": "", "session": "", "rank": "robot", "deadline_ms": None}  # with defaults
 _WITH_OBS = ("reset", "act", "observe")
+_RESET_PARAMETERS = {"self", "obs", "instruction"}  # which no option of a reset may be named
 _OF_RESET = ("instruction", "kwargs", "contract", "history")
 _OF_CLOSE = ("op", "step", *_OPTIONAL)
 _REQUEST_KEYS = {"op", "obs", "instruction", "kwargs", "contract", "history", "blobs", "step", *_OPTIONAL}
@@ -159,23 +160,25 @@ def _step(node: dict[str, Any]) -> Any:
 
 def check_request(request: Request, limits: Limits) -> Request:
     """Check the types and sizes that JSON itself does not enforce, for a request of any format; return the request."""
+    if not isinstance(request.kwargs, dict):  # a reference is an object in JSON, and may be an array, bytes or a number
+        raise MalformedMessage(f"kwargs: got {type(request.kwargs).__name__}, want an object")
+    if request.contract is not None and not isinstance(request.contract, dict):
+        raise MalformedMessage(f"contract: got {type(request.contract).__name__}, want an object")
     if request.op in ("act", "close") and (of_reset := [name for name in _OF_RESET if getattr(request, name)]):
         raise MalformedMessage(f"{request.op}: got {of_reset}, which a reset states for its whole episode")
     if request.obs is None and request.op in _WITH_OBS:
         raise MalformedMessage(f"{request.op}: no 'obs'; send the observation")
     for name in ("instruction", "request_id", "session"):
         text = getattr(request, name)
-        if text is not None and not isinstance(text, str):
+        if not isinstance(text, str) and not (name == "instruction" and text is None):
             raise MalformedMessage(f"{name}: got {type(text).__name__}, want text")
         if text and len(text) > (limits.text if name == "instruction" else NAME_CHARACTERS):
             raise MessageTooLarge(f"{name}: got {len(text)} characters, which is over the limit")
         if text and name != "instruction" and not is_name(text):
             raise MalformedMessage(f"{name}: got {text[:40]!r}, want visible ASCII characters without spaces")
-    for name in ("kwargs", "contract"):
-        value = getattr(request, name)
-        if value is not None and not isinstance(value, dict):
-            raise MalformedMessage(f"{name}: got {type(value).__name__}, want an object")
-    if request.rank not in RANKS:
+    if request.op == "reset" and (taken := _RESET_PARAMETERS & request.kwargs.keys()):
+        raise MalformedMessage(f"kwargs: got {sorted(taken)}, which are parameters of `reset` itself; rename them")
+    if not isinstance(request.rank, str) or request.rank not in RANKS:
         raise MalformedMessage(f"rank: got {shown(request.rank)}, want one of {list(RANKS)}")
     if request.deadline_ms is not None and not (
         is_number(request.deadline_ms) and 0 < request.deadline_ms < MOST_DEADLINE_MS

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import base64
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -98,4 +98,6 @@ def plain_values(value: Any) -> Any:
         return None
     if isinstance(value, (bytes, bytearray, memoryview)):
         return base64.b64encode(value).decode()
+    if isinstance(value, Sequence) and not isinstance(value, str):  # such as a deque, which a frame has as a list
+        return [plain_values(item) for item in value]
     return value

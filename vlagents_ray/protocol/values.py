@@ -177,6 +177,9 @@ def read_obs(node: Any, reader: ValueReader) -> Obs:
     if gripper is not None and not is_number(gripper):
         raise InvalidObservation(f"gripper: got {shown(gripper)}, want a number in [0, 1] where 1 = open")
     reader.decode_images(cameras)
+    read_info = reader.value(info)
+    if not isinstance(read_info, dict):  # a reference is an object in JSON, and may be an array, bytes or a number
+        raise MalformedMessage(f"obs.info: got {described(read_info)}, want an object")
     return Obs(
         cameras={name: as_camera(name, reader.blob(image), limits) for name, image in cameras.items()},
         gripper=None if gripper is None else float(gripper),
@@ -184,7 +187,7 @@ def read_obs(node: Any, reader: ValueReader) -> Obs:
             name: as_state(name, reader.blob(part) if isinstance(part, dict) else part, limits)
             for name, part in state.items()
         },
-        info=reader.value(info),
+        info=read_info,
     )
 
 

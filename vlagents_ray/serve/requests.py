@@ -121,6 +121,7 @@ class PendingRequest:
     # Of an act: the step at which the episode began that it was sent in, once that is known. Of a reset: that of the
     # connection's episode before, which goes on if the reset is undone.
     episode: int | None = None
+    model: Any = None  # for an act: the `LoadedModel` whose contract it was checked against
     opening: Opening | None = None  # for a reset: the server's settings
     # If a reset had to wait for its checkpoint: the time at which that was loaded, s. Such a reset runs even if it is
     # over, to release the checkpoint.

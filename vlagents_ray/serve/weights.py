@@ -661,6 +661,6 @@ def follows(options: dict[str, Any], *, by_default: bool) -> bool:
         InvalidInput: The option has another value than "follow" or "pinned".
     """
     wanted = options.pop(OPTION, _FOLLOW if by_default else _PINNED)
-    if wanted not in (_FOLLOW, _PINNED):
+    if not isinstance(wanted, str) or wanted not in (_FOLLOW, _PINNED):
         raise InvalidInput(f"{OPTION}: got {wanted!r}, want {_FOLLOW!r} (the newest version) or {_PINNED!r}")
     return bool(wanted == _FOLLOW)

@@ -316,6 +316,7 @@ class Engine:
             session.origin = origin
             if (model := session.model) is not None:  # another thread may set it to None
                 model.check(request)
+                pending.model = model
             if self._preparations is not None and self.queue.window.overlaps:
                 pending.preparation = self._preparations.begin(session.agent, request.obs)
         elif request.op == "reset":
@@ -575,6 +576,8 @@ class Engine:
             raise session.wrong_episode()
         if model is None or weights is None:
             raise UnknownSession(f"session {pending.session_id!r}: has just been closed; reset it")
+        if model is not pending.model:  # a reset before it in the queue chose another, or it has arrived since
+            model.check(pending.request)
         return session, model, weights
 
     def _observe(self, pending: PendingRequest) -> None:

@@ -81,7 +81,8 @@ class Checkpoints:
                 raise UnknownCheckpoint(
                     f"{STEP}: got {step!r} with the adapter {choice!r}, which has none; leave it out"
                 )
-            if rest.get(ADAPTER, choice) not in (None, choice):
+            adapter = rest.get(ADAPTER)
+            if adapter is not None and not (isinstance(adapter, str) and adapter == choice):
                 raise UnknownCheckpoint(f"{ADAPTER}: got {rest[ADAPTER]!r} and {CHOICE} {choice!r}, want one of them")
             return DEFAULT, {**rest, ADAPTER: choice}
         if choice is not None and (not isinstance(choice, str) or choice not in self._choices):

@@ -1,0 +1,275 @@
+"""A policy gets observations of exactly the declared types, and no malformed request is the server's failure."""
+
+from __future__ import annotations
+
+import collections
+import json
+import queue
+import struct
+import zlib
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+import pytest
+from dialect_server import client_of
+from in_flight import send
+from starlette.testclient import TestClient
+
+from vlagents_ray.contract import Contract, StateSpec
+from vlagents_ray.errors import InvalidInput, VLAgentsError
+from vlagents_ray.images.jpeg_png import encode_jpeg
+from vlagents_ray.interface import Act, Agent, Obs
+from vlagents_ray.protocol import frame_layout
+from vlagents_ray.protocol.frames import CONTENT_TYPE, decode_requests
+from vlagents_ray.protocol.messages import DEFAULT_LIMITS, Budget, Reply, Request
+from vlagents_ray.serve.access.api_keys import NoKey
+from vlagents_ray.serve.engine.engine import Engine
+from vlagents_ray.serve.engine.sender import Sender
+from vlagents_ray.serve.models.checkpoints import Checkpoints
+
+
+def require_types(obs: Obs) -> None:
+    """Fail unless each field has exactly the type of `Obs`."""
+    assert type(obs) is Obs
+    assert type(obs.cameras) is dict
+    assert type(obs.state) is dict
+    assert type(obs.info) is dict
+    assert obs.gripper is None or type(obs.gripper) is float
+    for name, image in obs.cameras.items():
+        assert (type(name), type(image), image.dtype, image.ndim) == (str, np.ndarray, np.uint8, 3)
+        assert image.shape[2] == 3
+    for name, part in obs.state.items():
+        assert (type(name), type(part), part.dtype, part.ndim) == (str, np.ndarray, np.float32, 1)
+    assert all(type(name) is str for name in obs.info)
+
+
+class Strict(Agent):
+    """Checks what it gets, and puts a value into its answers that only some encodings have."""
+
+    def __init__(self) -> None:
+        self.wrong: list[str] = []
+
+    def _check(self, obs: Obs) -> None:
+        try:
+            require_types(obs)
+        except AssertionError as error:
+            self.wrong.append(f"{error}: {obs}")
+
+    def reset(self, obs: Obs, instruction: str | None, **kwargs: Any) -> dict[str, Any]:
+        self._check(obs)
+        assert instruction is None or type(instruction) is str
+        return {"last": collections.deque([1, 2])}
+
+    def act(self, obs: Obs) -> Act:
+        self._check(obs)
+        return Act(np.zeros(2, np.float32), info={"last": collections.deque([1, 2]), "some": range(3)})
+
+
+POLICY = Strict()
+
+
+@pytest.fixture(scope="module")
+def client() -> Iterator[TestClient]:
+    engine = Engine(POLICY)
+    engine.start()
+    with client_of(engine, {}) as http:
+        yield http
+    engine.close()
+
+
+def chunk(name: bytes, data: bytes) -> bytes:
+    return struct.pack(">I", len(data)) + name + data + struct.pack(">I", zlib.crc32(data, zlib.crc32(name)))
+
+
+JPEG = encode_jpeg(np.zeros((8, 8, 3), np.uint8))
+PNG_HEAD = b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", struct.pack(">2I5B", 1, 1, 8, 2, 0, 0, 0))
+ODD_PNG = PNG_HEAD + chunk(b"IDAT", zlib.compress(bytes(4))) + chunk(b"gAMA", b"") + chunk(b"IEND", b"")
+BLOBS = [np.zeros(2, np.float32).tobytes(), JPEG, b"bytes", ODD_PNG, np.zeros(12, np.uint8).tobytes()]
+VALUES: list[Any] = [
+    None,
+    True,
+    -1,
+    1.5,
+    1e300,
+    10**400,
+    "",
+    "text",
+    "a b\n",
+    [],
+    [1, 2],
+    [[1]],
+    ["a"],
+    {},
+    {"a": 1},
+    {"": 1},
+    {"a": {"b": None}},
+    {"$": []},
+    {"$": ["float", "nan"]},
+    {"$": ["float", "inf"]},
+    {"$": ["nd", 0, "<f4", [2]]},
+    {"$": ["nd", 0, "<f4", [2, 1]]},
+    {"$": ["nd", 0, ">f4", [2]]},
+    {"$": ["nd", 0, "<i2", [4]]},
+    {"$": ["nd", 0, "|b1", [8]]},
+    {"$": ["nd", 4, "|u1", [2, 2, 3]]},
+    {"$": ["nd", 0, "|O", [1]]},
+    {"$": ["img", 1]},
+    {"$": ["img", 3]},
+    {"$": ["img", 2]},
+    {"$": ["bin", 2]},
+    {"a": {"$": ["nd", 0, "<f4", [2]]}},
+    {"a": {"$": ["img", 1]}},
+    {"a": {"$": ["img", 3]}},
+    {"a": {"$": ["bin", 2]}},
+    {"a": {"$": ["float", "-inf"]}},
+    {"obs": 1},
+    {"self": 1, "instruction": 2},
+]
+FIELDS = [
+    "obs",
+    "obs.cameras",
+    "obs.state",
+    "obs.info",
+    "obs.gripper",
+    "obs.cameras.front",
+    "obs.state.joints",
+    "obs.info.x",
+    "instruction",
+    "kwargs",
+    "kwargs.weights",
+    "kwargs.checkpoint",
+    "kwargs.checkpoint_step",
+    "kwargs.seed",
+    "contract",
+    "contract.action",
+    "history",
+    "request_id",
+    "session",
+    "rank",
+    "step",
+    "deadline_ms",
+]
+
+
+def with_value(field: str, value: Any) -> dict[str, Any]:
+    node: dict[str, Any] = {"obs": {}}
+    *folders, name = field.split(".")
+    inner = node
+    for folder in folders:
+        inner = inner.setdefault(folder, {})
+    inner[name] = value
+    return node
+
+
+def is_fine(status: int, field: str) -> bool:
+    """A deadline of a millisecond passes, which is no failure of the server either."""
+    return status < 500 or (field == "deadline_ms" and status == 504)
+
+
+@pytest.mark.parametrize("field", FIELDS)
+@pytest.mark.parametrize("op", ["reset", "act", "close"])
+def test_a_frame_with_any_value_in_any_field_is_answered(client: TestClient, op: str, field: str) -> None:
+    client.post("/v1/reset", headers={"x-session-id": "s"}, json={})
+    for value in VALUES:
+        node = {"op": op} | with_value(field, value)
+        content = b"".join(frame_layout.pack(node, list(BLOBS)))
+        answer = client.post(f"/v1/{op}", content=content, headers={"x-session-id": "s", "content-type": CONTENT_TYPE})
+        assert is_fine(answer.status_code, field), (field, value, answer.content)
+        if op == "close":
+            client.post("/v1/reset", headers={"x-session-id": "s"}, json={})
+    assert POLICY.wrong == []
+
+
+@pytest.mark.parametrize("field", [field for field in FIELDS if "camera" not in field])
+@pytest.mark.parametrize("op", ["reset", "act"])
+@pytest.mark.parametrize("as_form", [False, True])
+def test_a_document_with_any_value_in_any_field_is_answered(
+    client: TestClient, op: str, field: str, as_form: bool
+) -> None:
+    client.post("/v1/reset", headers={"x-session-id": "d"}, json={})
+    for value in VALUES:
+        node = with_value(field.removeprefix("obs."), value)
+        del node["obs"]
+        text = json.dumps(node)
+        files = {"obs": (None, text), "cameras.front": ("a", ODD_PNG)}
+        body: dict[str, Any] = {"files": files} if as_form else {"content": text}
+        headers = {"x-session-id": "d"} | ({} if as_form else {"content-type": "application/json"})
+        answer = client.post(f"/v1/{op}", headers=headers, **body)
+        assert is_fine(answer.status_code, field), (field, value, answer.content)
+    assert POLICY.wrong == []
+
+
+@pytest.mark.parametrize("op", ["reset", "act", "close", "observe", "unknown", None, {"$": ["nd", 0, "<f4", [2]]}, []])
+def test_what_a_decoder_returns_has_the_types_of_an_observation(op: Any) -> None:
+    """At the endpoints without status codes: own port, shared memory and plasma."""
+    for field in FIELDS:
+        for value in VALUES:
+            data = b"".join(frame_layout.pack({"op": op} | with_value(field, value), list(BLOBS)))
+            try:
+                decoded = decode_requests(data, Budget(DEFAULT_LIMITS))
+            except VLAgentsError:
+                continue
+            for request in decoded.requests:
+                for obs in (*request.history, *([] if request.obs is None else [request.obs])):
+                    require_types(obs)
+                assert (type(request.request_id), type(request.session), type(request.rank)) == (str, str, str)
+                assert type(request.kwargs) is dict
+            assert all(isinstance(reply.error, VLAgentsError) for reply in decoded.refused.values())
+
+
+@pytest.mark.parametrize("name", ["self", "obs", "instruction"])
+def test_an_option_named_as_a_parameter_of_reset_is_refused(client: TestClient, name: str) -> None:
+    answer = client.post("/v1/reset", headers={"x-session-id": "k"}, json={"kwargs": {name: 1}})
+    assert answer.status_code == 400
+    assert "parameters of `reset`" in answer.json()["detail"]
+
+
+def test_an_answer_is_the_same_in_json_and_in_a_frame(client: TestClient) -> None:
+    client.post("/v1/reset", headers={"x-session-id": "j"}, json={})
+    answer = client.post("/v1/act", headers={"x-session-id": "j"}, json={})
+    assert answer.status_code == 200
+    assert answer.json()["info"].items() >= {"last": [1, 2], "some": [0, 1, 2]}.items()
+
+
+class Joints(Agent):
+    def __init__(self, dim: int = 0) -> None:
+        self.dim = dim
+
+    @property
+    def contract(self) -> Contract | None:
+        return Contract(state={"joints": StateSpec(dim=self.dim)}) if self.dim else None
+
+    def act(self, obs: Obs) -> Act:
+        assert not self.dim or len(obs.state["joints"]) == self.dim
+        return Act(np.zeros(2, np.float32))
+
+
+@pytest.mark.parametrize("order", [("own", "arm7"), ("arm3", "arm7"), ("own", "arm3")])
+def test_an_act_behind_a_reset_is_checked_against_the_contract_of_that_reset(order: tuple[str, str]) -> None:
+    """In one frame, the act is checked as it arrives, when the session still has the earlier checkpoint."""
+    choices = {"arm7": {"dim": 7}, "arm3": {"dim": 3}}
+    engine = Engine(Checkpoints(lambda config: Joints(config.get("dim", 0)), {}, choices))
+    engine.start()
+    sender = Sender(engine, "websocket", caller=NoKey.OPEN)
+    observations = {n: Obs(state={"joints": np.zeros(n, np.float32)}) for n in (3, 7)}
+
+    def ask(*requests: Request) -> list[Reply]:
+        answers: queue.SimpleQueue[list[Reply]] = queue.SimpleQueue()
+        send(sender, list(requests), answers.put)
+        return answers.get(timeout=20)
+
+    def reset(name: str) -> Request:
+        length = choices.get(name, {"dim": 3})["dim"]
+        return Request("reset", observations[length], kwargs={} if name == "own" else {"checkpoint": name}, session="s")
+
+    first, second = order
+    for name in (second, first):  # so that both are loaded
+        assert ask(reset(name))[0].error is None
+    fitting_first, wrong_second = (3, 7) if second == "arm3" else (3, 3)
+    assert ask(Request("act", observations[fitting_first], session="s"))[0].error is None
+    answers = ask(reset(second), Request("act", observations[wrong_second], session="s"))
+    assert answers[0].error is None
+    assert isinstance(answers[1].error, InvalidInput)
+    assert f"want ({choices[second]['dim']},)" in str(answers[1].error)
+    engine.close()
