@@ -309,6 +309,7 @@ def _masked(first: int, payload: bytes = b"") -> bytes:
     return bytes([first]) + frame_head(len(payload), bytes(4))[1:] + payload
 
 
+@cache
 def _bomb() -> bytes:
     """A compressed message: 16 kB of 16 MiB."""
     compressor = zlib.compressobj(9, zlib.DEFLATED, -12)

@@ -447,6 +447,7 @@ class WebSocketConnection(PolledConnection):
             with self._sending:
                 self._protocol.fail(_UNSUPPORTED_DATA, "messages in fragments; send each in one frame")
                 self._flush()
+            self._charge_abuse()
             return
         sender, message = self._sender, self._sender.message()
         admission = admission or sender.admission(self._limits)
