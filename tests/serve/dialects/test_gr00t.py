@@ -28,6 +28,10 @@ from many import many
 from vlagents_ray.errors import InvalidObservation, MalformedMessage, MessageTooLarge, VLAgentsError
 from vlagents_ray.protocol.messages import Limits
 from vlagents_ray.serve.access import api_keys
+from vlagents_ray.serve.access.api_keys import NoKey
+from vlagents_ray.serve.dialects.base import GatewayContext
+from vlagents_ray.serve.dialects.gr00t import GR00TDialect
+from vlagents_ray.serve.ports import free_port, reserve
 from vlagents_ray.wire import gr00t as gr00t_codec
 
 LIMITS = Limits()
@@ -458,3 +462,43 @@ def test_mutated_messages_get_an_error_or_an_answer(open_dialect, replicas: Repl
     finally:
         bad.close()
         context.term()
+
+
+def test_a_dialect_that_ends_answers_every_request(replicas: Replicas) -> None:
+    config = GR00TDialect.Config(port=free_port())
+    context = GatewayContext(
+        "noop",
+        lambda _key, rank: replicas.agent(rank=rank or "robot", timeout_s=20.0),
+        Limits(),
+        8,
+        30.0,
+        None,
+        NoKey.OPEN,
+    )
+    dialect = GR00TDialect("gr00t", config, context)
+    dialect.serve(reserve("gr00t", "127.0.0.1", config.port))
+    with PolicyClient(config.port) as waiting, PolicyClient(config.port) as late:
+        for client in (waiting, late):
+            client.get_action(seen(5))
+        replicas.frozen.add(0)
+        answers: dict[str, str] = {}
+
+        def ask(name: str, client: PolicyClient) -> None:
+            try:
+                answers[name] = str(client.get_action(seen(5)))
+            except Exception as error:  # noqa: BLE001 - the client's own, with the server's text
+                answers[name] = str(error)
+
+        threads = [threading.Thread(target=ask, args=("waiting", waiting))]
+        threads[0].start()
+        wait_for(lambda: any(client._unanswered for client in dialect._clients._clients.values()))
+        closing = threading.Thread(target=dialect.close)
+        closing.start()
+        wait_for(dialect._stopping.is_set)
+        threads.append(threading.Thread(target=ask, args=("late", late)))
+        threads[1].start()
+        for thread in (closing, *threads):
+            thread.join(20)
+        assert sorted(answers) == ["late", "waiting"], "a client waits for ever"
+        assert all("stopping" in text for text in answers.values()), answers
+    replicas.frozen.clear()

@@ -243,3 +243,23 @@ def test_an_endpoint_takes_a_free_port_of_those_it_may() -> None:
         assert port < endpoint.address.port <= port + 20
         endpoint.close()
     engine.close()
+
+
+def test_a_replica_that_stops_closes_its_connections_with_a_code_and_a_reason() -> None:
+    engine = Engine(Echo())
+    endpoint = WebSocketServer(engine, Limits(), "127.0.0.1", None, NoKey.OPEN)
+    endpoint.open()
+    engine.start()
+    url = f"ws://127.0.0.1:{endpoint.address.port}{endpoint.address.path}"
+    with connect(url) as idle, connect(url) as waiting:
+        waiting.send(encode_requests([Request("reset", Obs())]))
+        assert decode_replies(waiting.recv(5))[0].error is None
+        engine.close()
+        waiting.send(encode_requests([Request("act", Obs())]))  # which is not read any more
+        endpoint.close()
+        for client in (idle, waiting):
+            with pytest.raises(ConnectionClosed) as closed:
+                client.recv(5)
+            assert closed.value.rcvd is not None
+            assert closed.value.rcvd.code == 1012
+            assert "stopping" in closed.value.rcvd.reason

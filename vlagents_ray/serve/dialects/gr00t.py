@@ -18,7 +18,7 @@ from typing import Any
 from pydantic import Field
 
 from vlagents_ray.contract import Contract
-from vlagents_ray.errors import MalformedMessage, VLAgentsError
+from vlagents_ray.errors import MalformedMessage, PolicyUnavailable, VLAgentsError
 from vlagents_ray.registry import require
 from vlagents_ray.serve.access.api_keys import NoKey
 from vlagents_ray.serve.config.dialects import MappingSetting, PortConfig
@@ -40,6 +40,7 @@ _MOST_PARTS, _MOST_PART_BYTES = 4, 256  # of an envelope that is answered with a
 _HEARTBEAT_MS = 10_000
 _TICK_MS = 500
 _END_S = 3.0
+_LINGER_MS = 1000  # time for sending the last answers
 _STRANGERS = 64  # maximum number of connections without a valid key
 _STRANGERS_MS = 50  # period at which their bytes are counted
 _STRANGER_S = 30.0  # time within which a connection must send a valid key
@@ -57,6 +58,7 @@ class GR00TConnection(GatewayClient):
         self._mapping, self._flat = nested_mapping(mapping)  # flat: whether the client's last keys were N1.5's
         self._send = answer
         self._requests: queue.SimpleQueue[tuple[Envelope, bytes] | None] = queue.SimpleQueue()
+        self._waiting: list[Envelope] = []  # the envelopes of the requests without an answer
         self._lock = threading.Lock()
         self.thread = threading.Thread(target=self._run, name="gr00t-client", daemon=True)
         self.thread.start()
@@ -72,11 +74,18 @@ class GR00TConnection(GatewayClient):
                 return False
             self._context.admission.hold(len(payload), True, 0)
             self._unanswered += 1
+            self._waiting.append(envelope)
         self._requests.put((envelope, payload))
         return True
 
     def end(self) -> None:
         self._requests.put(None)
+
+    def unanswered(self) -> list[Envelope]:
+        """Return the envelopes of the requests without an answer, which then get none from this client's thread."""
+        with self._lock:
+            waiting, self._waiting = self._waiting, []
+        return waiting
 
     def _run(self) -> None:
         while (request := self._requests.get()) is not None:
@@ -86,7 +95,11 @@ class GR00TConnection(GatewayClient):
             with self._lock:
                 self._unanswered -= 1
                 self._used = time.monotonic()
-            self._send(envelope, message)
+                is_waiting = envelope in self._waiting
+                if is_waiting:
+                    self._waiting.remove(envelope)
+            if is_waiting:
+                self._send(envelope, message)
             time.sleep(self.sessions.throttled_s())
         self.sessions.close()
 
@@ -141,6 +154,10 @@ class GR00TConnection(GatewayClient):
         }
 
 
+def _stopping() -> PolicyUnavailable:
+    return PolicyUnavailable("the server is stopping; send the request again to its successor")
+
+
 def _theirs(entries: Iterable[tuple[str, str]], needed: Iterable[str]) -> list[str]:
     """Return the client's names of the policy's cameras or states; `*` in the mapping keeps the policy's names."""
     found: dict[str, None] = {}
@@ -193,7 +210,8 @@ class GR00TDialect(PortDialect):
         self._answers: queue.SimpleQueue[tuple[Envelope, bytes]] = queue.SimpleQueue()
         self._bell, self._ring = socket.socketpair()
         self._ring.setblocking(False)
-        self._closing = threading.Event()
+        self._stopping = threading.Event()  # whether new requests are refused
+        self._closing = threading.Event()  # whether all requests are answered
         self._thread: threading.Thread | None = None
         self._strangers: _Strangers | None = None
 
@@ -207,12 +225,17 @@ class GR00TDialect(PortDialect):
         return self._thread is not None and self._thread.is_alive()
 
     def close(self) -> None:
+        self._stopping.set()  # a client of this protocol waits for ever for an answer that does not come
+        until = time.monotonic() + _END_S
+        for client in self._clients.end_all():
+            client.thread.join(max(0.0, until - time.monotonic()))
+            for envelope in client.unanswered():
+                error = _stopping()
+                self.answer(envelope, gr00t.pack({"error": f"{error.code}: {error}"}))
         self._closing.set()
         self._wake()
         if self._thread is not None:
             self._thread.join(_END_S)
-        for client in self._clients.end_all():
-            client.thread.join(_END_S)
         self._bell.close()
         self._ring.close()
 
@@ -268,13 +291,15 @@ class GR00TDialect(PortDialect):
                 if now - self._looked >= _TICK_MS / 1e3:
                     self._looked = now
                     self._clients.forget_quiet()
+            self._receive(router, zmq)
+            self._send(router, zmq)
         except Exception:
             logger.exception("gr00t: the dialect has failed, and accepts no more clients")
         finally:
             listener.close()
             if self._strangers is not None:
                 self._strangers.close()
-            router.close()
+            router.close(linger=_LINGER_MS)
             authenticator.close()
             context.destroy(linger=0)
 
@@ -307,6 +332,8 @@ class GR00TDialect(PortDialect):
 
     def _take(self, envelope: Envelope, payload: Any, descriptor: int) -> None:
         """Pass a message to its client, which is created once a message of its connection has a valid key."""
+        if self._stopping.is_set():
+            raise _stopping()
         identity, *added = envelope
         if added not in _ENVELOPES:
             self._refuse(descriptor)

@@ -40,7 +40,7 @@ logger = logging.getLogger(__name__)
 
 BACKLOG = 128
 MOST_UNANSWERED = 256  # unanswered messages of a client; further ones stay unread in its connection
-POLICY_VIOLATION, INTERNAL_ERROR = 1008, 1011  # WebSocket close codes
+POLICY_VIOLATION, INTERNAL_ERROR, _SERVICE_RESTART = 1008, 1011, 1012  # WebSocket close codes
 # Maximum number of connections that a server accepts in a second; each takes some time of the policy's thread.
 _ACCEPTED_PER_S = 200.0
 # Reasons for not polling a connection.
@@ -275,6 +275,7 @@ class PolledServer(ABC, Generic[C]):
         self._listener.close()
         self._spare.close()
         for client in list(self._clients):
+            client.end("the replica is stopping; connect again", _SERVICE_RESTART)
             client.release()
 
     def accept(self) -> None:

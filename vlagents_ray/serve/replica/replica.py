@@ -153,20 +153,22 @@ class PolicyReplica(ClientApi, SiblingApi):
         self._tasks = [asyncio.ensure_future(work) for work in works]
 
     async def close(self) -> None:
-        """Close everything: first the sources of requests, then the engine, then its observers, and last the endpoints.
+        """Close everything: first the sources of requests, then the engine, the endpoints, and last the observers.
 
-        In this order the engine can answer waiting requests over open endpoints, and observers receive all answers.
+        In this order the engine can answer waiting requests over open endpoints, no client waits for the observers, and
+        observers receive all answers.
         """
         for task in self._tasks:
             task.cancel()
         if self._engine.draining:
             await self._migrator.hand_over()
         await self._migrator.close()
-        for part in (self._engine, self._observers, self._metrics):
-            await asyncio.to_thread(part.close)
+        await asyncio.to_thread(self._engine.close)
         for endpoint in (self._local, self._plasma, self._stream):
             if endpoint is not None:
                 endpoint.close()
+        for part in (self._observers, self._metrics):
+            await asyncio.to_thread(part.close)
 
     async def __del__(self) -> None:
         if self._opened:
