@@ -4,10 +4,12 @@ Control loop, chunk player, guard, watchdog and command inbox are those of a rob
 the operator and all clocks are simulated, so that a day takes minutes, and a seed replays exactly. Checked at each
 command:
 
-- no step above 3 times the largest one of a run without faults, also not from the measured pose after a stop;
+- no step above 3 times the largest one of a run without faults, and none above the limit of speed, also not from the
+  measured pose after a stop;
 - no command after a stop or a pause until the operator at the robot has restarted it.
 
-Exit status: 0 without a violation, else 1. `--hours` and the seed repeat a violation, whose time the report has.
+`--relative` plays the day with relative actions, `--arms 2` with two arms. Exit status: 0 without a violation, else 1.
+`--hours` and the seed repeat a violation, whose time the report has.
 
 `--ticks 20000` measures in place of a day what a tick costs: of the guard, and from `observe` until `apply` with and
 without it.
@@ -54,7 +56,9 @@ _SWAY = 0.0005  # rad, distance of the paths of two chunks
 _SMOOTHING = 0.5  # share of the distance to its target that a joint moves in a tick
 _LAG = 1.0  # ticks by which the joints are behind their targets, with that smoothing
 REST = (_RADIUS, 0.0, 0.3, 0.0, 0.0, 0.0, 1.0)
-LIMITS = Limits(velocity=2.0, acceleration=15.0, jerk=1000.0, rest=REST)
+SPEED = 2.0  # rad/s
+LIMITS = Limits(velocity=SPEED, acceleration=15.0, jerk=1000.0, rest=(*REST[:6], None))  # of an arm
+_PULL = 0.0005  # rad, largest correction of a relative action towards the path in a tick
 FAULTS = {  # the mean duration of each, s; 0: a moment
     "killed": 15.0,
     "frozen": 5.0,
@@ -102,6 +106,8 @@ class DayReport:
     ticks: int = 0
     commands: int = 0
     moving_s: float = 0.0
+    relative: bool = False
+    arms: int = 1
     runs: int = 0
     failed_runs: int = 0  # that ended by an error
     stops: int = 0
@@ -117,11 +123,15 @@ class DayReport:
 class World:
     """The simulated arm, its surroundings and its operator; `robot` methods are those of `vlagents_ray.robot.Robot`."""
 
-    def __init__(self, seed: int, hours: float, *, faults: bool) -> None:
+    def __init__(self, seed: int, hours: float, *, faults: bool, relative: bool = False, arms: int = 1) -> None:
         self.clock = DayClock()
-        self.report = DayReport(seed, hours)
+        self.report = DayReport(seed, hours, relative=relative, arms=arms)
         self.random = np.random.default_rng(seed)
-        self.joints = np.array(REST, np.float32)
+        names = tuple(f"arm{number}" for number in range(arms)) if arms > 1 else None
+        self.action = ActionSpec(dim=len(REST) * arms, delta=relative, gripper_open=1.0, gripper_closed=0.0, arms=names)
+        self.deltas = self.action.delta_columns(len(REST) * arms)
+        self.grippers = self.action.gripper_columns(len(REST) * arms)
+        self.joints = np.tile(np.array(REST, np.float32), arms)
         self.target = self.joints.copy()
         self.commanded = self.joints.copy()  # the last command, or the pose at rest
         self.holds: str | None = None
@@ -151,20 +161,26 @@ class World:
     def apply(self, action: np.ndarray) -> None:
         """Check and execute a command."""
         report = self.report
-        step = float(np.abs(action - self.commanded).max())
+        target = action.copy()
+        target[self.deltas] += self.commanded[self.deltas]
+        step = float(np.abs(target - self.commanded).max())
         report.commands += 1
         report.moving_s += (step > 0) / HZ
         report.largest_step = max(report.largest_step, step)
         if report.normal_step and step > FACTOR * report.normal_step:
             self.violated(f"a step of {step:.4f} rad")
+        if report.normal_step and step > 1.001 * SPEED / HZ + 1e-5:
+            self.violated(f"a step of {step:.4f} rad, over the limit of speed")
         if self.forbidden is not None:
             self.violated(f"a command after: {self.forbidden}")
         self._sum.update(action.tobytes())
-        self.target = self.commanded = action.copy()
+        self.target = self.commanded = target
 
     def stop(self, reason: str = "") -> None:
-        """Make the present pose the target."""
-        self.target = self.commanded = self.joints.copy()
+        """Make the present pose the target; the grippers keep their grasp."""
+        held = self.joints.copy()
+        held[self.grippers] = self.target[self.grippers]
+        self.target = self.commanded = held
 
     def violated(self, what: str) -> None:
         """Record a violation."""
@@ -174,7 +190,8 @@ class World:
 
     def measured(self, obs: Obs) -> np.ndarray:
         """Return the measured pose for the guard."""
-        return np.full(7, np.nan, np.float32) if self.has("broken sensor") else obs.state["joints"]
+        joints = obs.state["joints"]
+        return np.full_like(joints, np.nan) if self.has("broken sensor") else joints
 
     def advance(self, seconds: float) -> None:
         """Let time pass: faults begin and end, the watchdog looks, and the operator comes."""
@@ -225,7 +242,7 @@ class World:
             self.clock.offset += self.random.normal(0.0, 10.0)
         elif fault == "pushed":  # only an arm without commands can be moved by hand
             if self.forbidden is not None:
-                self.joints = self.joints + self.random.uniform(-0.2, 0.2, 7).astype(np.float32)
+                self.joints = self.joints + self.random.uniform(-0.2, 0.2, len(self.joints)).astype(np.float32)
                 self.stop()
         else:
             do = fault.partition(" ")[0]
@@ -250,10 +267,11 @@ class DayWatchdog(Watchdog):
 class DayPolicy(Agent):
     """A policy that leads the arm around a closed path from any pose, behind a network and a server with faults."""
 
-    contract = Contract(action=ActionSpec(dim=7, delta=False), chunk=CHUNK)
+    contract: Contract | None = None
 
     def __init__(self, world: World) -> None:
         self.world = world
+        self.contract = Contract(action=world.action, chunk=CHUNK)
         self._cold = True
 
     def act(self, obs: Obs) -> Act:
@@ -291,17 +309,23 @@ class DayPolicy(Agent):
     def _rows(self, joints: np.ndarray) -> np.ndarray:
         world, random = self.world, self.world.random
         begin = math.atan2(float(joints[1]), float(joints[0])) + _TURN * _LAG
-        angle = begin + _TURN * np.arange(1, CHUNK + 1)
-        radius, zeros = _RADIUS + random.uniform(-_SWAY, _SWAY), np.zeros(CHUNK)
+        angle = begin + _TURN * np.arange(CHUNK + 1)
+        radius, zeros = _RADIUS + random.uniform(-_SWAY, _SWAY), np.zeros(CHUNK + 1)
         columns = [radius * np.cos(angle), radius * np.sin(angle), 0.3 * np.cos(2 * angle), zeros, zeros, zeros]
-        rows = np.stack([*columns, (1 + np.cos(angle)) / 2], 1).astype(np.float32)
+        path = np.stack([*columns, (1 + np.cos(angle)) / 2], 1)
+        path = np.tile(path, (1, world.report.arms))
+        rows = path[1:].astype(np.float32)
+        if world.deltas:
+            behind = np.roll(path, 1, axis=0)[1:]
+            pull = np.clip((path[0] - joints) / CHUNK, -_PULL, _PULL)  # of the lag, too, which is the same all day
+            rows[:, world.deltas] = (path[1:] - behind + pull)[:, world.deltas]
         place = int(random.integers(CHUNK))
         if world.has("NaN"):
             rows[place, 2] = np.nan
         if world.has("wrong shape"):
-            return rows[:, :6]
+            return rows[:, :-1]
         if world.has("jump"):
-            rows[place:, 3] += 0.5
+            rows[place : place + 1 if world.deltas else None, 3] += 0.5
         if world.has("beyond limits"):
             rows[place:, 0] = 9.0
         return rows
@@ -379,7 +403,9 @@ def simulated_time(world: World) -> Iterator[None]:
         yield
 
 
-def play_day(seed: int, hours: float, *, faults: bool = True, normal_step: float = 0.0) -> DayReport:
+def play_day(
+    seed: int, hours: float, *, faults: bool = True, normal_step: float = 0.0, relative: bool = False, arms: int = 1
+) -> DayReport:
     """Play a day.
 
     Args:
@@ -387,17 +413,28 @@ def play_day(seed: int, hours: float, *, faults: bool = True, normal_step: float
         hours: Its length.
         faults: Whether there are any.
         normal_step: The largest step of a run without faults, rad; 0 checks no steps.
+        relative: Whether actions are relative.
+        arms: The number of arms, of seven numbers each.
 
     Returns:
         The figures.
     """
-    world = World(seed, hours, faults=faults)
+    world = World(seed, hours, faults=faults, relative=relative, arms=arms)
     world.report.normal_step = normal_step
     held: Counter[str] = Counter()
-    guard = DayGuard(DayPolicy.contract, low=-3.0, high=3.0, measure=world.measured, limits=LIMITS, hz=HZ)
+    policy = DayPolicy(world)
+    rest = None if relative or LIMITS.rest is None else LIMITS.rest * arms
+    guard = DayGuard(
+        policy.contract,
+        low=-3.0,
+        high=3.0,
+        measure=None if relative else world.measured,
+        limits=replace(LIMITS, rest=rest),
+        hz=HZ,
+    )
     guard.world = world
-    settings = PlayerSettings(mode="async", safe="hold", max_age_s=2.0)
-    with simulated_time(world), ChunkPlayer(DayPolicy(world), settings, check=guard) as driver:
+    settings = PlayerSettings(mode="async", max_age_s=2.0)
+    with simulated_time(world), ChunkPlayer(policy, settings, check=guard) as driver:
         while world.clock.now < hours * 3600:
             world.report.runs += 1
             left_s = min(RUN_S, hours * 3600 - world.clock.now)
@@ -485,6 +522,8 @@ def measure_ticks(ticks: int) -> dict[str, dict[str, float]]:
 def main(
     seed: int = 0,
     hours: Annotated[float, typer.Option(help="of simulated time")] = 24.0,
+    relative: Annotated[bool, typer.Option(help="play it with relative actions")] = False,
+    arms: Annotated[int, typer.Option(min=1, max=8)] = 1,
     ticks: Annotated[int, typer.Option(help="measure the cost of so many ticks, and play no day")] = 0,
     out_file: Out = None,
 ) -> None:
@@ -496,8 +535,8 @@ def main(
             out.print(f"{name}: {figures}")
         return
     with errors():
-        normal = play_day(seed, 1 / 6, faults=False).largest_step
-        report = play_day(seed, hours, normal_step=normal)
+        normal = play_day(seed, 1 / 6, faults=False, relative=relative, arms=arms).largest_step
+        report = play_day(seed, hours, normal_step=normal, relative=relative, arms=arms)
     save({"day": asdict(report)}, out_file)
     for name, value in asdict(report).items():
         out.print(f"{name}: {value}")

@@ -10,11 +10,14 @@ from vlagents_ray.robot import Limits
 MINUTES = 1 / 60
 
 
-def test_minutes_with_faults_have_no_jump_and_no_command_after_a_stop() -> None:
-    normal = day.play_day(0, 2 * MINUTES, faults=False)
+@pytest.mark.parametrize("arms", [1, 2])
+@pytest.mark.parametrize("relative", [False, True], ids=["absolute", "relative"])
+def test_minutes_with_faults_have_no_jump_and_no_command_after_a_stop(relative: bool, arms: int) -> None:
+    normal = day.play_day(0, 2 * MINUTES, faults=False, relative=relative, arms=arms)
     assert normal.stops == 0
     assert normal.moving_s > 100  # of 120
-    report = day.play_day(3, 20 * MINUTES, normal_step=normal.largest_step)
+    assert normal.held.get("dynamics", 0) < 10, "without a fault the guard refuses hardly any of 6000 actions"
+    report = day.play_day(3, 20 * MINUTES, normal_step=normal.largest_step, relative=relative, arms=arms)
     assert report.violations == []
     assert report.stops > 3
     assert report.restarts > 0

@@ -244,3 +244,27 @@ def test_a_simulated_robot_has_its_grippers_where_they_were_commanded(delta: boo
     for _ in range(60):
         opening = robot.observe().gripper
     assert opening == pytest.approx(0.0, abs=1e-3)
+
+
+def test_arms_whose_openings_are_unknown_stand_until_the_first_action_that_is_accepted() -> None:
+    """No safe action is known of them, and the loop needs none for a robot that stands."""
+    spec = spec_of(True, 2)
+
+    class TooFast(Agent):
+        contract = Contract(action=spec, chunk=10)
+        answers = 0
+
+        def act(self, obs: Obs) -> Act:
+            self.answers += 1
+            rows = np.zeros((10, 8), np.float32)
+            rows[:, 0] = 0.5 if self.answers < 4 else 0.001
+            rows[:, spec.gripper_columns(8)] = OPEN
+            return Act(rows)
+
+    robot = SimulatedRobot(TooFast.contract)
+    guard = Guard(TooFast.contract, limits=limits_of(2, NO_LIMIT), hz=200)
+    with ChunkPlayer(TooFast(), PlayerSettings(deadline_s=30.0), check=guard) as player:
+        report = run_loop(robot, player, hz=200, seconds=0.5)
+    assert report.safe.get("max_step", 0) + report.safe.get("dynamics", 0) > 0
+    assert robot.applied > 20
+    assert abs(float(robot._target[0])) < 0.5

@@ -194,6 +194,11 @@ class Motion:
         self._before: np.ndarray | None = None  # the last one of earlier ticks
         self._state: Literal["stopped", "moving", "held"] = "stopped"
 
+    @property
+    def begun(self) -> bool:
+        """Whether an action was commanded in this episode."""
+        return self._last is not None
+
     def keeps(self, plan: ChunkBuffer) -> bool:
         """Return whether the plan must stay: a robot that comes from rest is on its way to the next row.
 
@@ -256,6 +261,8 @@ class Motion:
         if self._safe is None:
             raise InvalidAction(f"no action for this tick: {why.reason}")
         self._ease = None
+        if self._last is None:  # the first command was refused
+            self._state = "stopped"
         last = self._standing(obs) if self._state == "stopped" else self._last
         try:
             action = self._checked(self._safe(obs, last), last)

@@ -467,7 +467,13 @@ class ChunkPlayer(Agent):
         if held is not None and self.control.running:  # the loop commands nothing
             action = np.zeros(0, np.float32)
         else:
-            action, why = self._motion.hold(obs, why)
+            try:
+                action, why = self._motion.hold(obs, why)
+            except InvalidAction:
+                # The loop commands nothing to a robot that stands, such as one whose grippers' openings are unknown.
+                if self._motion.begun or not self.control.running or not self._motion.can_hold:
+                    raise
+                action = np.zeros(0, np.float32)
             if held is not None:  # the policy's action will not be executed
                 self._note_in_place(action)
         return Act(action, info={SAFE: why.reason, CAUSE: why.cause, SILENT: self._silent_s()})

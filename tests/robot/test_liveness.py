@@ -1,0 +1,97 @@
+"""Every plan within half of the limits is executed within a bounded time, from wherever the arm stands before it."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+import numpy as np
+import pytest
+
+from vlagents_ray import Act, ActionSpec, Agent, ChunkPlayer, Contract, Obs, PlayerSettings
+from vlagents_ray.interface import SAFE
+from vlagents_ray.robot import Guard, Limits
+
+SPEED, ACCELERATION, JERK = 1.5, 15.0, 600.0  # those of docs/control_loop.md
+RUN_S = 4.0
+RUNS = 25  # a test; four seeds make 100
+
+
+class Swinging(Agent):
+    """A plan of one joint, a sine at a share of the strictest limit; row k of it is the same in each answer."""
+
+    contract: Contract | None = None
+
+    def __init__(self, random: np.random.Generator, hz: float, share: float, *, delta: bool) -> None:
+        self.contract = Contract(action=ActionSpec(dim=1, space="joint", delta=delta))
+        self._delta, self._hz = delta, hz
+        self._turn = 2 * np.pi * random.uniform(0.05, 3.0)  # rad/s
+        self._phase = random.uniform(0, 2 * np.pi)
+        strictest = min(SPEED / self._turn, ACCELERATION / self._turn**2, JERK / self._turn**3)
+        self._radius = share * strictest
+
+    def pose(self, row: np.ndarray | float) -> np.ndarray:
+        """Return the pose at a row of the plan."""
+        return self._radius * np.sin(self._turn * np.asarray(row) / self._hz + self._phase)
+
+    def act(self, obs: Obs) -> Act:
+        rows = int(obs.state["row"][0]) + np.arange(int(2 * RUN_S * self._hz))
+        actions = self.pose(rows)
+        if self._delta:
+            actions = actions - self.pose(rows - 1)
+        return Act(actions[:, None].astype(np.float32))
+
+
+def executed(
+    random: np.random.Generator, mode: Literal["open_loop", "async"], share: float, soft_start_s: float, *, delta: bool
+) -> tuple[float, int]:
+    """Return the share of a run's ticks that were rows of the plan, and the number of refused actions."""
+    hz = float(random.choice([10, 30, 50, 100]))
+    policy = Swinging(random, hz, share, delta=delta)
+    # Where the first row is, a row before it, between rows, and ahead of it.
+    pose = np.float32(policy.pose(random.choice([0.0, -1.0, -0.5, 0.3])))
+    guard = Guard(
+        policy.contract,
+        limits=Limits(velocity=SPEED, acceleration=ACCELERATION, jerk=JERK),
+        hz=hz,
+        measure=None if delta else (lambda obs: obs.state["joints"]),
+        soft_start_s=soft_start_s,
+    )
+    settings = PlayerSettings(mode, deadline_s=30.0, safe=np.zeros(1, np.float32) if delta else "hold")
+    ticks, refused = int(RUN_S * hz), 0
+    with ChunkPlayer(policy, settings, check=guard) as player:
+        player.initialize()
+
+        def observed() -> Obs:
+            row = np.array([player._plan.executed], np.float32)
+            return Obs(state={"joints": np.array([pose], np.float32), "row": row})
+
+        player.reset(observed())
+        for _ in range(ticks):
+            act = player.act(observed())
+            refused += act.info.get("safe_cause") in ("dynamics", "max_step", "limits")
+            assert SAFE not in act.info or act.info["safe_cause"] in ("dynamics", "max_step", "waiting")
+            pose = np.float32(pose + act.action[0]) if delta else act.action[0]
+        return player._plan.executed / ticks, refused
+
+
+@pytest.mark.parametrize("delta", [False, True], ids=["absolute", "relative"])
+@pytest.mark.parametrize(
+    ("share", "soft_start_s"), [(0.5, 0.0), (0.25, 120.0)], ids=["half of the limits", "half in the soft start"]
+)
+@pytest.mark.parametrize("seed", range(4))
+def test_a_plan_within_half_of_the_limits_is_executed(
+    delta: bool, share: float, soft_start_s: float, seed: int
+) -> None:
+    random = np.random.default_rng(seed)
+    for _ in range(RUNS):
+        rows, refused = executed(random, "open_loop", share, soft_start_s, delta=delta)
+        assert refused == 0
+        assert rows > 0.5, "the ease-in is over within half of the run"
+
+
+@pytest.mark.parametrize("delta", [False, True], ids=["absolute", "relative"])
+def test_answers_during_the_ease_in_do_not_keep_the_robot_from_moving(delta: bool) -> None:
+    random = np.random.default_rng(9)
+    for _ in range(5):
+        rows, _ = executed(random, "async", 0.5, 0.0, delta=delta)
+        assert rows > 0.3
