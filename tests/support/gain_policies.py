@@ -13,6 +13,7 @@ import numpy as np
 
 from vlagents_ray.interface import Act, Agent, Obs
 from vlagents_ray.serve.weights import WeightsVersion
+from vlagents_ray.weights import trainable
 
 
 class Gain(Agent):
@@ -50,17 +51,11 @@ class Doubled(Gain):
 
 
 class DyingInAPush(Gain):
-    """Its process ends when a push reads its parameters, which a load and a loaded policy have done before."""
+    """Its process ends when the values of a push are checked."""
 
     def initialize(self) -> None:
         super().initialize()
-        self.read = 0
-
-    def parameters(self) -> dict[str, Any]:
-        self.read += 1
-        if self.read > 2:
-            os._exit(9)
-        return super().parameters()
+        trainable.accepted = lambda *_, **__: os._exit(9)
 
     def load_parameters(self, named: Mapping[str, Any]) -> None:
         super().load_parameters(named)

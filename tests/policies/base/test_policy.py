@@ -205,6 +205,22 @@ def test_the_named_network_is_quantized_once_loaded_and_no_weights_can_be_pushed
         policy.parameters()
 
 
+@pytest.mark.parametrize("kind", ["cuda", "cpu"])
+@pytest.mark.parametrize("compiled", ["graphs", False, True, "require"])
+def test_weights_of_8_bits_on_a_gpu_need_compiled_products(
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture, kind: str, compiled: bool | str
+) -> None:
+    monkeypatch.setattr("vlagents_ray.policies.base.policy.quantize", lambda *_: None)
+    monkeypatch.setattr(Wobble, "_decide_on_compiling", lambda _: None)
+    monkeypatch.setattr(Wobble, "_warm_up", lambda _: None)
+    policy = Wobble.from_config({"checkpoint": "none", "quantization": "int8"})
+    policy.compilation.mode = compiled  # type: ignore[assignment]
+    monkeypatch.setattr(Wobble, "load", lambda _: report_device({"kind": kind, "onnxruntime": "1"}))
+    policy.initialize()
+    warned = "quantization 'int8' without compile: true" in caplog.text
+    assert warned == (kind == "cuda" and compiled in ("graphs", False))
+
+
 def test_what_torchao_cannot_quantize_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
     def fail(network: Any, config: Any) -> None:
         raise NotImplementedError("no such kernel")
