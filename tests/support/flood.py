@@ -380,6 +380,8 @@ def attack(way: str, part: str, where: Where, connections: int, seconds: float) 
     make, send = WAYS[way]
     end = time.monotonic() + seconds
     message = b"" if part in BEHAVIOURS else PARTS.get(part, make)()
+    if part in REPEATED:
+        REPEATED[part]()  # before it is measured, since the bomb takes time to make
 
     def flood() -> None:
         while time.monotonic() < end:

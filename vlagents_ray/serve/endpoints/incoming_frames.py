@@ -163,6 +163,9 @@ class IncomingFrames(asyncio.Protocol):
                     self._has_message = True
             if self._hold_memory():
                 self._protocol.data_received(part)
+            if self._protocol.conn.parser_exc is not None:  # an invalid frame: uvicorn closes the connection
+                self._charge()
+                self._end_reading()
         self._update()
 
     def _begin_frame(self) -> bool:
