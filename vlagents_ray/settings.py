@@ -13,6 +13,7 @@ import numpy as np
 from vlagents_ray.errors import ConfigError, shown
 from vlagents_ray.naming import did_you_mean
 
+_WORD_ERRORS = ("int_parsing", "float_parsing", "bool_parsing", "list_type")
 _WANT = "Input should be "  # pydantic's wording
 # Types of values that a plain type allows: also numpy's, and whole numbers for a float, since YAML reads 1 as int.
 _PLAIN: dict[type, tuple[type, ...]] = {
@@ -86,6 +87,11 @@ def _sentence(item: Mapping[str, Any], model: type | None, option: str | None) -
     name = str(item["loc"][-1]) if item["loc"] else ""
     beside = _fields(model, item["loc"][:-1])
     got = item["input"] if isinstance(item["input"], (bool, int, float)) else type(item["input"]).__name__
+    if item["type"] in _WORD_ERRORS and isinstance(item["input"], str):  # in place of a number or a list: no secret
+        got = shown(item["input"])
+        message = message.partition(", unable to")[0]
+        if item["type"] == "list_type":
+            message += f", such as [{item['input'][:40]}]"
     if item["type"] == "literal_error" and isinstance(item["input"], str):  # a word of a list is no secret
         got = shown(item["input"])
         message += did_you_mean(item["input"], item["ctx"]["expected"].split("'")[1::2])

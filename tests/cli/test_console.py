@@ -77,6 +77,9 @@ def test_envs_are_listed_with_their_cures_and_ranges_of_tasks(
             ("too", "no", "55 tasks: goal/0..49, other, long/1..2, odd/1, odd/3"),
         ]
     assert said.partition("\n\n")[2] == f"for the rest:\n  elsewhere, too: {CURE}\n"
+    with pytest.raises(typer.Exit):
+        envs("nope")
+    assert "'nope' is not registered; there are elsewhere, too" in shown.getvalue()
 
 
 def test_a_listing_is_as_wide_as_a_terminal_and_has_a_line_for_each_elsewhere(shown: io.StringIO) -> None:

@@ -40,9 +40,9 @@ class Page:
                 assert "error" not in message, message
                 return message["result"]
 
-    def open(self, path: Path | str, *, width: int, scheme: str) -> None:
-        """Load a file or an address, in a window of this width, for a reader who prefers this colour scheme."""
-        self.call("Emulation.setDeviceMetricsOverride", width=width, height=900, deviceScaleFactor=1, mobile=False)
+    def open(self, path: Path | str, *, width: int, scheme: str, height: int = 900) -> None:
+        """Load a file or an address, in a window of this size, for a reader who prefers this colour scheme."""
+        self.call("Emulation.setDeviceMetricsOverride", width=width, height=height, deviceScaleFactor=1, mobile=False)
         self.call("Emulation.setEmulatedMedia", features=[{"name": "prefers-color-scheme", "value": scheme}])
         self.call("Page.navigate", url=path if isinstance(path, str) else path.as_uri())
         while True:

@@ -129,7 +129,8 @@ def connection_lines(
         if keyed and keys is None:
             with contextlib.suppress(ConfigError):  # the keys are on the cluster's machines
                 keyed = args.access.keys() is not None
-        curl = 'curl -H "Authorization: Bearer $VLAGENTS_RAY_API_KEY" ' if keyed else ""
+        ca = "--cacert CA.pem " if keyed and url.startswith("https") else ""
+        curl = f'curl {ca}-H "Authorization: Bearer $VLAGENTS_RAY_API_KEY" ' if keyed else ""
         yield f"  API: {curl}{url}/docs"
         if not (insecure or args.access.insecure):  # --insecure shows no live page
             yield f"  live page: {url}/live"

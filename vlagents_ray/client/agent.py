@@ -33,6 +33,7 @@ from vlagents_ray.errors import (
 from vlagents_ray.images.codecs import RAW, ImageCodec
 from vlagents_ray.interface import DEADLINE, Act, Agent, Obs, copied
 from vlagents_ray.protocol.messages import RANKS, RankName, Reply, Request
+from vlagents_ray.protocol.values import require_obs
 from vlagents_ray.registry import require
 from vlagents_ray.tracing import TRACEPARENT, tracer
 
@@ -317,6 +318,8 @@ class RemoteAgent(Agent):
             The result of `reset` for each session, or its exception, which affects only that session.
         """
         siblings = self._siblings(sessions)
+        for first in obs:
+            require_obs(first)
         self._connection.open()
         stated = contract.to_json() if isinstance(contract, Contract) else contract
         history = (self._connection.contract.history if self._connection.contract else None) or 1
@@ -347,6 +350,7 @@ class RemoteAgent(Agent):
         its own coding, the network, and proxies. `batch_size` is a number of requests, not a time.
         """
         commands = self._commands
+        require_obs(obs)
         [act] = self.act_batch([obs if commands is None else commands.asking(obs)], [self])
         if commands is not None:
             commands.came(act)
@@ -367,6 +371,8 @@ class RemoteAgent(Agent):
         siblings = self._siblings(sessions)
         if len(obs) != len(siblings):
             raise ConfigError(f"act_batch: got {len(obs)} observations for {len(siblings)} sessions")
+        for one in obs:
+            require_obs(one)
         requests = [session.act(one) for session, one in zip(siblings, obs, strict=True)]
         replies = self._call(siblings, requests, min(self._connection.timeout_s, _deadline_s(obs)))
         round_trip_ms = (time.perf_counter() - begun) * 1e3

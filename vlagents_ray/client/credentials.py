@@ -62,11 +62,18 @@ class Credentials:
             return None
         try:
             context = ssl.create_default_context(cafile=self.ca)
-            if self.certificate is not None:
-                context.load_cert_chain(*self.certificate)
         except OSError as error:  # ssl.SSLError is a subclass
             raise ConfigError(
-                f"TLS: ca={self.ca!r}, certificate={self.certificate!r}: not PEM files that belong together ({error})"
+                f"TLS: ca={self.ca!r}: expected a file with the certificate of the CA that signed the server's, in "
+                f"PEM (it begins with -----BEGIN CERTIFICATE-----), got {error}"
+            ) from error
+        try:
+            if self.certificate is not None:
+                context.load_cert_chain(*self.certificate)
+        except OSError as error:
+            raise ConfigError(
+                f"TLS: certificate={self.certificate!r}: expected this client's certificate and its private key, two "
+                f"PEM files that belong together, got {error}"
             ) from error
         return context
 

@@ -108,6 +108,8 @@ def build_agent(
     """
     if not issubclass(kind := policy_class(policy), Agent):
         raise UnknownPolicy(f"policy {policy!r}: is no Agent; derive the class from vlagents_ray.Agent")
+    if kind.act is Agent.act and kind.act_batch is Agent.act_batch:
+        raise ConfigError(f"policy {policy!r}: expected a class that defines act or act_batch, got {kind.__name__}")
     try:
         agent: Agent = kind.from_config(config)
     except ConfigError as error:

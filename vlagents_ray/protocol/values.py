@@ -230,6 +230,41 @@ def as_state(name: str, part: Any, limits: Limits) -> np.ndarray:
         raise InvalidObservation(f"state {name!r}: got a number beyond those of float32, want it within") from error
 
 
+def require_obs(obs: Any) -> None:
+    """Raise `InvalidObservation` for a value of a program that cannot be sent as an observation."""
+    if not isinstance(obs, Obs):
+        raise InvalidObservation(
+            f"observation: expected an Obs, got {described(obs)}; make one, as in Obs(cameras={{…}}, state={{…}})"
+        )
+    for name, value in (("cameras", obs.cameras), ("state", obs.state), ("info", obs.info)):
+        if not isinstance(value, Mapping):
+            raise InvalidObservation(f"{name}: expected a dict of values by name, got {described(value)}")
+    for name, image in obs.cameras.items():
+        if not hasattr(image, "dtype"):
+            raise InvalidObservation(
+                f"camera {name!r}: expected (H, W, 3) uint8 RGB, got {described(image)}; leave out a camera that has "
+                f"no picture, and convert others: np.asarray(image, np.uint8)"
+            )
+    for name, part in obs.state.items():
+        if not hasattr(part, "dtype") or part.dtype.kind not in "fiub":
+            _as_float32(name, part)
+    if obs.gripper is not None:
+        try:
+            float(obs.gripper)
+        except (TypeError, ValueError) as error:
+            raise InvalidObservation(f"gripper: expected None or a number, got {described(obs.gripper)}") from error
+
+
+def _as_float32(name: str, part: Any) -> np.ndarray:
+    try:
+        array = np.asarray(part)
+        if part is None or array.dtype.kind not in "fiubO":  # text and complex numbers would also be converted
+            raise TypeError
+        return array.astype(np.float32)
+    except (TypeError, ValueError) as error:
+        raise InvalidObservation(f"state {name!r}: expected (D,) float32, numbers, got {described(part)}") from error
+
+
 def write_obs(obs: Obs, writer: ValueWriter, codec: ImageCodec) -> dict[str, Any]:
     """Convert an observation, which is not changed, to its JSON form; raw images and arrays are views, not copies."""
     if codec.name == "raw":

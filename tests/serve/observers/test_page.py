@@ -18,7 +18,7 @@ from live_server import Address, LiveServer, ask, live_server
 from vlagents_ray import Obs, RemoteAgent
 from vlagents_ray.chunking.player import ChunkPlayer, PlayerSettings
 from vlagents_ray.client.commands import CommandInbox
-from vlagents_ray.contract import ActionSpec, Contract
+from vlagents_ray.contract import ActionSpec, CameraSpec, Contract
 from vlagents_ray.errors import PolicyFailed
 from vlagents_ray.interface import Act, Agent
 from vlagents_ray.policies.noop import Noop
@@ -46,10 +46,10 @@ def server() -> Iterator[LiveServer]:
         yield one
 
 
-def show(page: Page, server: LiveServer, *, width: int = 1400, scheme: str = "light") -> None:
+def show(page: Page, server: LiveServer, *, width: int = 1400, scheme: str = "light", height: int = 900) -> None:
     page.said.clear()
     page.asked.clear()
-    page.open(Address(f"{server.url}/live"), width=width, scheme=scheme)  # type: ignore[arg-type]
+    page.open(Address(f"{server.url}/live"), width=width, scheme=scheme, height=height)  # type: ignore[arg-type]
 
 
 def until(page: Page, expression: str, want: object) -> None:
@@ -151,12 +151,13 @@ PRESS = "(text) => [...document.querySelectorAll('article button')].find((one) =
 
 
 @contextmanager
-def operated(server: LiveServer, key: str | None = None) -> Iterator[list[LoopReport]]:
+def operated(server: LiveServer, key: str | None = None, cameras: int = 0) -> Iterator[list[LoopReport]]:
     """A simulated robot that obeys the page."""
+    specs = {f"camera{number}": CameraSpec(480, 480) for number in range(cameras)}
     commands, over, reports = CommandInbox(), threading.Event(), []
     with RemoteAgent(server.url, api_key=key, commands=commands) as agent:
         robot, player = (
-            SimulatedRobot(Contract(action=ActionSpec(7))),
+            SimulatedRobot(Contract(cameras=specs, action=ActionSpec(7))),
             ChunkPlayer(agent, PlayerSettings(mode="async", safe="hold")),
         )
         thread = threading.Thread(
@@ -191,6 +192,35 @@ def test_buttons_act_on_a_session(page: Page, server: LiveServer, width: int, sc
         assert page.said == []
         outside = [url for url in page.asked if not url.startswith(("blob:", "data:", server.url))]
         assert outside == []
+
+
+@pytest.mark.parametrize("cameras", [1, 2, 3])
+@pytest.mark.parametrize(("width", "height"), [(1280, 800), (1280, 1000), (1024, 600), (360, 740)])
+def test_stop_is_in_sight_without_scrolling_whatever_the_cameras(
+    page: Page, server: LiveServer, width: int, height: int, cameras: int
+) -> None:
+    wait_for(lambda: len(server.engine.sessions) == 0, 30)
+    loaded = "[...document.querySelectorAll('article img')].filter((one) => one.naturalWidth === 480).length"
+    with operated(server, cameras=cameras):
+        show(page, server, width=width, height=height)
+        until(page, loaded, cameras)
+        stop = "document.querySelector('article button.stop').getBoundingClientRect()"
+        assert page.value("scrollY") == 0
+        assert 0 <= page.value(f"{stop}.top") < page.value(f"{stop}.bottom") <= height
+        assert page.value("document.documentElement.scrollWidth") <= width
+
+
+def test_a_card_of_a_stopped_robot_says_so(page: Page, server: LiveServer) -> None:
+    wait_for(lambda: len(server.engine.sessions) == 0, 30)
+    stopped = "document.querySelector('article .stopped').checkVisibility()"
+    with operated(server):
+        show(page, server)
+        until(page, CARDS, 1)
+        assert page.value(stopped) is False
+        page.value(f"({PRESS})('Stop')")
+        until(page, stopped, True)
+        assert page.value("document.querySelector('article .stopped').textContent").startswith("Stopped by ")
+        assert page.said == []
 
 
 def test_it_asks_for_a_key_and_watches_with_one(page: Page) -> None:

@@ -168,10 +168,17 @@ class HttpTransport:
             except ssl.SSLError as error:
                 raise tls_failure(self._url.geturl(), error) from error
             except OSError as error:
-                raise NoReplica(f"{self._url.geturl()}: cannot connect ({error}); is it running?") from error
+                raise no_replica(self._url.geturl(), error) from error
             connection.sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
             self._connection = connection, DeadlineSocket.install(connection)
         return self._connection
+
+
+def no_replica(url: str, error: Exception) -> NoReplica:
+    """Return the error of a client that cannot connect."""
+    if isinstance(error, socket.gaierror) and error.errno == socket.EAI_NONAME:
+        return NoReplica(f"{url}: there is no host of this name ({error}); is it spelt right?")
+    return NoReplica(f"{url}: cannot connect ({error}); is it running?")
 
 
 def http_url(url: str) -> SplitResult:

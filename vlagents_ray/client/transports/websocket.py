@@ -27,8 +27,8 @@ from websockets.uri import parse_uri
 
 from vlagents_ray.client.credentials import ANONYMOUS, WEBSOCKET_LOG, Credentials, require_plain, tls_failure
 from vlagents_ray.client.transports.base import FAST_S, SPIN_S, CodecChoice, await_answer, first_timeout_s, left_s, wait
-from vlagents_ray.client.transports.http import HttpTransport, http_url, refusal
-from vlagents_ray.errors import ConnectionLost, DeadlineExceeded, MessageTooLarge, NoReplica, PolicyUnavailable
+from vlagents_ray.client.transports.http import HttpTransport, http_url, no_replica, refusal
+from vlagents_ray.errors import ConnectionLost, DeadlineExceeded, MessageTooLarge, PolicyUnavailable
 from vlagents_ray.protocol.frame_layout import Buffer
 from vlagents_ray.protocol.frames import decode_replies, request_parts
 from vlagents_ray.protocol.messages import (
@@ -106,7 +106,7 @@ def open_websocket(url: str, credentials: Credentials, timeout_s: float) -> Prox
     except (OSError, InvalidHandshake, TimeoutError) as error:
         if isinstance(error, InvalidHandshake):
             require_plain(urlsplit(url), timeout_s)
-        raise NoReplica(f"{url}: cannot connect ({error}); is it running?") from error
+        raise no_replica(url, error) from error
 
 
 class Stream:

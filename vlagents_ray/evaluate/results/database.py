@@ -85,6 +85,11 @@ def require_readable(out: Path, db: sqlite3.Connection) -> None:
             raise ConfigError(
                 f"{out / FILE}: got {name!r}, which is a {kind} that no evaluation makes: do not trust its author"
             )
+    if not db.execute("SELECT count(*) FROM sqlite_master").fetchone()[0]:
+        raise ConfigError(
+            f"{out / FILE}: expected a database of results, got an empty file, as of a copy that was cut off; copy it "
+            f"again, or choose another folder"
+        )
     if (version := db.execute("PRAGMA user_version").fetchone()[0]) != VERSION:
         raise ConfigError(f"{out / FILE}: got version {version} of the results, want {VERSION}; choose another folder")
     for table, known in _known_columns().items():

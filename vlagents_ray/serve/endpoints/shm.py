@@ -318,9 +318,15 @@ class MemoryFiles:
     def _add(self, number: int, descriptor: int) -> None:
         try:
             size = os.fstat(descriptor).st_size
-            if size > 2 * self._limits.body_bytes or number >= LocalAddress.FILES:
+            most_bytes = 2 * self._limits.body_bytes
+            if size > most_bytes:
                 raise MessageTooLarge(
-                    f"local: memory file {number} of {size} bytes; {LocalAddress.FILES} files are the limit"
+                    f"local: expected a message of at most {most_bytes} bytes, got {size}; send smaller images, or "
+                    f"raise `limits.body_bytes` of the deployment"
+                )
+            if number >= LocalAddress.FILES:
+                raise MessageTooLarge(
+                    f"local: expected at most {LocalAddress.FILES} memory files of a connection, got one more"
                 )
             # Reading beyond the end of a file that has shrunk would kill this process.
             if not fcntl.fcntl(descriptor, fcntl.F_GET_SEALS) & fcntl.F_SEAL_SHRINK:

@@ -436,7 +436,7 @@ class Engine:
         try:
             self._run(taken.batch)
         except BaseException as error:  # a policy that calls sys.exit() must not end the replica's only thread
-            if not self.threaded:  # Ctrl-C in the thread that called
+            if not self.threaded and not isinstance(error, SystemExit):  # Ctrl-C in the thread that called
                 raise
             logger.exception("the batch failed")
             for pending in taken.batch:

@@ -240,6 +240,10 @@ def _checked(document: object, source: str, step_follows: bool = False) -> Deplo
             require_no_secrets(one.runtime_env)
             for stated in one.deployments:
                 require_no_secrets((stated.get("ray_actor_options") or {}).get("runtime_env") or {})
+        for app in config.applications:
+            meant = did_you_mean(app.import_path, [IMPORT_PATH])
+            if app.import_path != IMPORT_PATH and meant:
+                raise ConfigError(f"{source}: {app.name}: import_path: got {app.import_path!r}{meant}")
         for app in our_apps(config):
             args = ServerArgs(**app.args)
             # Relative paths refer to this process's folder, so Ray gets absolute ones.

@@ -237,9 +237,11 @@ class Card {
     const unique = `${cards.size}-${Date.now()}`;
     this.name = element("p", { id: `name-${unique}`, className: "name", title: id }, id.replace(/([0-9a-f]{8})[0-9a-f]{24}$/, "$1")); // 32 of them are drawn at random
     this.outcome = element("p", { className: "note", role: "status" });
+    this.stopped = element("p", { className: "stopped", role: "status", hidden: true });
+    this.stoppedAt = null; // the step at which a person stopped the robot, until it begins another episode
     this.operated = this.buttons();
     this.numbers = element("details", {}, element("summary", {}, "Numbers"), this.drawn, this.told);
-    this.root = element("article", {}, this.instruction, this.name, this.error, this.cameras, this.operated, this.numbers);
+    this.root = element("article", {}, this.instruction, this.name, this.stopped, this.error, this.operated, this.cameras, this.numbers);
     this.instruction.id = `session-${unique}`;
     this.root.setAttribute("aria-labelledby", `session-${unique} name-${unique}`);
     this.filter();
@@ -268,6 +270,7 @@ class Card {
     this.save.hidden = !ring;
     this.save.textContent = `Save last ${ring} s`;
     this.commands(said.commands);
+    this.halt(said.commands, said.step);
     if (said.last) this.act(said.last);
     this.root.classList.toggle("silent", said.silent_s > 5);
     this.tell({ step: said.step, "weights version": said.version, "last request": `${said.silent_s.toFixed(1)} s ago` });
@@ -322,6 +325,17 @@ class Card {
     if (!last || state === this.last) return;
     this.last = state;
     this.say(OUTCOMES[last.state](last), ["refused", "ignored", "too late"].includes(last.state));
+  }
+
+  halt(said, step) {
+    const stop = said.filter((one) => one.do === "stop" && one.state === "done").pop();
+    if (stop && stop.id !== this.stop) {
+      this.stop = stop.id;
+      this.stoppedAt = step;
+      this.stopped.textContent = `Stopped by ${stop.by || "a person"}`;
+    } else if (this.stoppedAt !== null && step < this.stoppedAt) this.stoppedAt = null;
+    this.stopped.hidden = this.stoppedAt === null;
+    this.root.classList.toggle("halted", this.stoppedAt !== null);
   }
 
   // A chunk is drawn as it is; single actions as the last of them.

@@ -1,0 +1,269 @@
+"""The mistakes that first users make on a command line: each is answered at once, in one message with its cure."""
+
+from __future__ import annotations
+
+import json
+import os
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import yaml
+from typer.testing import CliRunner
+
+from vlagents_ray import InvalidObservation, Obs
+from vlagents_ray.cli.main import app
+from vlagents_ray.protocol.values import require_obs
+
+LONGEST_S = 20.0  # of CPU time, for one mistake
+POLICIES = """
+import numpy as np
+from vlagents_ray import Act, ActionSpec, Agent, Contract, StateSpec
+
+
+class Base(Agent):
+    @property
+    def contract(self):
+        return Contract(state={"xyzrpy": StateSpec(6, "m+rad")}, action=ActionSpec(dim=4, delta=True))
+
+    def initialize(self):
+        pass
+
+    def reset(self, obs, instruction, **options):
+        return {}
+
+
+class WithoutAct(Base):
+    pass
+
+
+class WrongKey(Base):
+    def act(self, obs):
+        return Act(obs.info["absent"])
+
+
+class WrongShape(Base):
+    def act(self, obs):
+        return Act(np.zeros(3, np.float32))
+
+
+class NotFinite(Base):
+    def act(self, obs):
+        return Act(np.full(4, np.nan, np.float32))
+
+
+class Text(Base):
+    def act(self, obs):
+        return "forward"
+
+
+class Ends(Base):
+    def act(self, obs):
+        raise SystemExit(5)
+
+
+class DoesNotLoad(Base):
+    def initialize(self):
+        raise FileNotFoundError("weights.bin")
+
+    def act(self, obs):
+        return Act(np.zeros(4, np.float32))
+
+
+class NoAgent:
+    pass
+"""
+POLICY, SUITE = {"source": "noop"}, {"envs": ["tabletop"]}
+APP = {"import_path": "vlagents_ray.serve.app:build", "args": {"policy": "noop"}}
+EVAL = ["eval", "tabletop", "--episodes", "1", "--workers", "0", "--video", "none", "--out", "out", "--policy"]
+
+
+def run(**changes: Any) -> str:
+    return yaml.safe_dump({"policies": [POLICY], "suites": [SUITE]} | changes)
+
+
+def served(**changes: Any) -> str:
+    return yaml.safe_dump({"applications": [APP | changes]})
+
+
+def with_args(**changes: Any) -> str:
+    return served(args={"policy": "noop"} | changes)
+
+
+# (words, parts of the message); a text in place of a word is the content of a file x.yaml, which the word names.
+COMMANDS: dict[str, tuple[list[str], list[str]]] = {
+    "no command of this name": (["evl"], ["evl", "eval"]),
+    "no option of this name": (["eval", "tabletop", "--episods", "3"], ["--episods", "--episodes"]),
+    "no out": (["eval", "tabletop", "--policy", "noop"], ["--out"]),
+    "no policy": (["eval", "tabletop", "--out", "out"], ["--policy"]),
+    "env misspelt": ([*EVAL, "noop", "tabeltop"], ["tabeltop", "tabletop"]),
+    "policy misspelt": ([*EVAL, "noope"], ["noope", "noop"]),
+    "policy file absent": ([*EVAL, "nope.yaml"], ["nope.yaml", "does not exist"]),
+    "module absent": ([*EVAL, "absent:Policy"], ["absent"]),
+    "class absent": ([*EVAL, "own:Nope"], ["Nope"]),
+    "no agent": ([*EVAL, "own:NoAgent"], ["Agent"]),
+    "setting misspelt": ([*EVAL, "noop", "--set", "chunks=2"], ["chunks", "chunk"]),
+    "setting of another type": ([*EVAL, "noop", "--set", "delta=maybe"], ["delta", "'maybe'", "boolean"]),
+    "setting without a value": ([*EVAL, "noop", "--set", "delta"], ["delta", "KEY=VALUE"]),
+    "env setting misspelt": ([*EVAL, "noop", "--env-set", "maxsteps=3"], ["maxsteps", "max_steps"]),
+    "env setting negative": ([*EVAL, "scripted", "--env-set", "width=-5"], ["width", "-5"]),
+    "--workers 0 in a cluster": ([*EVAL, "noop", "--address", "auto"], ["--address", "workers"]),
+    "too many episodes": (
+        ["eval", "tabletop", "--policy", "noop", "--out", "o", "--episodes", "99999999999"],
+        ["1000000"],
+    ),
+    "until without watch": ([*EVAL, "noop", "--until", "3"], ["--until", "--watch"]),
+    "codec of another name": (["eval", run(policies=[POLICY | {"codec": "png"}])], ["'png'", "'lossless'"]),
+    "transport of another name": (["eval", run(policies=[POLICY | {"transport": "grpc"}])], ["'grpc'", "'auto'"]),
+    "file absent": (["eval", "nope.yaml"], ["nope.yaml", "does not exist"]),
+    "file with options of suites": (["eval", run(), "--episodes", "3"], ["episodes", "write that there"]),
+    "file empty": (["eval", " "], ["a mapping with", "policies"]),
+    "file a list": (["eval", "- 1"], ["list", "a mapping with"]),
+    "file with a tab": (["eval", "policies:\n\t- x"], ["not YAML", "line 2"]),
+    "key twice": (["eval", run(workers=0) + "workers: 3\n"], ["'workers'", "twice", "keep one"]),
+    "key misspelt": (["eval", run(suites=[SUITE | {"episods": 3}])], ["episods", "episodes"]),
+    "text for a number": (["eval", run(suites=[SUITE | {"episodes": "two"}])], ["'two'", "integer"]),
+    "half an episode": (["eval", run(suites=[SUITE | {"episodes": 2.5}])], ["2.5", "integer"]),
+    "negative": (["eval", run(suites=[SUITE | {"episodes": -2}])], ["-2", "1"]),
+    "exponent": (["eval", run().replace("envs:", "episodes: 1e12\n  envs:")], ["1000000"]),
+    "text for a list": (["eval", run(suites=[{"envs": "tabletop"}])], ["'tabletop'", "[tabletop]"]),
+    "word of no list": (["eval", run(video="all_of_them")], ["all_of_them", "'failures'"]),
+    "no source": (["eval", run(policies=[{"name": "x"}])], ["source", "url"]),
+    "source and url": (["eval", run(policies=[POLICY | {"url": "http://x:1"}])], ["source", "url", "both"]),
+    "one name twice": (["eval", run(policies=[POLICY, POLICY])], ["name"]),
+    "many steps": (
+        ["eval", run(policies=[POLICY | {"steps": {"first": 0, "last": 10**9, "every": 1}}])],
+        ["10000", "every"],
+    ),
+    "serve: file absent": (["serve", "nope.yaml"], ["nope.yaml", "does not exist"]),
+    "serve: key misspelt": (["serve", with_args(replicsa=2)], ["replicsa", "replicas"]),
+    "serve: batch of 0": (["serve", with_args(batch={"max_size": 0})], ["max_size", "1"]),
+    "serve: replicas without end": (["serve", with_args(replicas=10**9)], ["replicas", "10000"]),
+    "serve: import path": (
+        ["serve", served(import_path="vlagents_ray.serve.ap:build")],
+        ["import_path", "'vlagents_ray.serve.app:build'"],
+    ),
+    "serve: file empty": (["serve", " "], ["mapping", "applications"]),
+    "serve: hub id": (["serve", "lerobot/smolvla_base"], ["deployments/lerobot.yaml"]),
+    "serve: no checkpoint": (["serve", "pi0"], ["checkpoint", "deployments/pi0.yaml", "docs/policies/pi0.md"]),
+    "serve: no keys": (["serve", "noop", "--host", "0.0.0.0"], ["keys new", "--insecure"]),  # noqa: S104
+    "serve: keys file absent": (["serve", "noop", "--keys", "nope.json"], ["nope.json", "keys new"]),
+    "serve: half of TLS": (["serve", "noop", "--tls-cert", "x.pem"], ["--tls-key"]),
+    "serve: text for a port": (["serve", "noop", "--port", "http"], ["--port"]),
+    "key: expired before": (["keys", "new", "x", "--days", "-5"], ["--days", "0.001"]),
+    "key: expired at once": (["keys", "new", "x", "--days", "0"], ["--days", "0.001"]),
+    "key: name": (["keys", "new", "a b"], ["'a b'", "letters"]),
+    "key: rate": (["keys", "new", "x", "--rate", "0"], ["--rate", "0.001"]),
+    "key: scope": (["keys", "new", "x", "--scope", "wach"], ["'wach'", "did you mean 'watch'"]),
+    "key: rank": (["keys", "new", "x", "--rank", "simulaton"], ["did you mean 'simulation'"]),
+    "key: revoke without a file": (["keys", "revoke", "x"], ["keys new"]),
+    "key: revoke another": (["keys", "revoke", "arm1", "--keys", "k.json"], ["arm1", "'arm-1'", "did you mean"]),
+    "new: kind": (["new", "polic", "x"], ["polic", "policy"]),
+    "new: name": (["new", "policy", "1 bad"], ["1 bad", "my_policy"]),
+    "new: installed": (["new", "policy", "numpy"], ["'numpy'", "hide"]),
+    "new: keyword": (["new", "policy", "class"], ["'class'", "module"]),
+    "env make": (["env", "make", "nothing.txt"], ["nothing.txt", "requirements file"]),
+    "tune: no file": (["tune", "noop"], ["deployment file", ".yaml"]),
+    "tune: absent": (["tune", "nope.yaml"], ["nope.yaml", "does not exist"]),
+    "policies: misspelt": (["policies", "opnpi"], ["'opnpi'", "'openpi'"]),
+    "report: nothing there": (["report", "nowhere"], ["nowhere", "results"]),
+    "report: empty database": (["report", "emptied"], ["results.db", "empty file"]),
+    "report: text as database": (["report", "texted"], ["results.db"]),
+    "export: kind": (["export", "nowhere", "--out", "x.csv", "--to", "xlsx"], ["'xlsx'", "csv"]),
+    "export: folder": (["export", "nowhere", "--out", "no/x.csv", "--to", "csv"], ["no", "make it first"]),
+    "bundle: folder": (["bundle", "nowhere", "--out", "no/x.zip"], ["no/x.zip", "make it first"]),
+    "verify: a text": (["verify", "own.py"], ["own.py"]),
+    "replay: no policy": (["replay", "dataset"], ["--policy"]),
+    "replay: episodes": (["replay", "dataset", "--policy", "noop", "--only", "a-b"], ["'a-b'", "0-9,12"]),
+}
+MADE = {"env setting negative"}  # mistakes that are found when the environment is made, after the folder of results
+# In this process, until the policy's error: (policy, parts of the message).
+EPISODES = {
+    "WithoutAct": ["act or act_batch"],
+    "WrongKey": ["KeyError", "own.py:"],
+    "WrongShape": ["(3,)", "4"],
+    "NotFinite": ["NaN or infinity"],
+    "Text": ["str", "Act"],
+    "Ends": ["SystemExit"],
+    "DoesNotLoad": ["weights.bin", "own.py:"],
+}
+
+
+@pytest.fixture(autouse=True)
+def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.delitem(__import__("sys").modules, "own", raising=False)
+    (tmp_path / "own.py").write_text(POLICIES)
+    for name, text in (("emptied", ""), ("texted", "no database")):
+        (tmp_path / name).mkdir()
+        (tmp_path / name / "results.db").write_text(text)
+    (tmp_path / "dataset" / "meta").mkdir(parents=True)
+    (tmp_path / "dataset" / "meta" / "info.json").write_text("{}")
+    key = {"name": "arm-1", "sha256": "0" * 64}
+    (tmp_path / "k.json").write_text(json.dumps({"keys": [key]}))
+    return tmp_path
+
+
+def answer(words: list[str]) -> tuple[int, str]:
+    """Run a command line in this process; returns its status and message on one line."""
+    began = time.process_time()
+    done = CliRunner().invoke(app, words, env={"COLUMNS": "1000", "TERMINAL_WIDTH": "1000"})
+    assert time.process_time() - began < LONGEST_S
+    assert done.exception is None or isinstance(done.exception, SystemExit), repr(done.exception)
+    assert "Traceback" not in done.output
+    return done.exit_code, " ".join(done.output.split())
+
+
+@pytest.mark.parametrize("mistake", COMMANDS)
+def test_a_mistake_on_the_command_line_is_answered_with_its_cure(mistake: str, folder: Path) -> None:
+    words, parts = COMMANDS[mistake]
+    (folder / "x.yaml").write_text(words[1] if len(words) > 1 else "")
+    before = sorted(os.listdir(folder))
+    is_text = len(words) > 1 and (":" in words[1] or words[1] in (" ", "- 1"))
+    status, message = answer([words[0], "x.yaml", *words[2:]] if is_text else words)
+    assert status == 2, message
+    assert [part for part in parts if part not in message] == [], message
+    assert sorted(os.listdir(folder)) == sorted([*before, *(["out"] if mistake in MADE else [])])
+
+
+@pytest.mark.parametrize("policy", EPISODES)
+def test_a_mistake_in_a_policy_is_answered_with_its_place(policy: str) -> None:
+    status, message = answer([*EVAL, f"own:{policy}"])
+    assert status in (1, 2, 3), message
+    error = message.rpartition(" error ")[2] or message
+    assert [part for part in EPISODES[policy] if part not in error] == [], message
+
+
+IMAGE, STATE = np.zeros((4, 4, 3), np.uint8), np.zeros(6, np.float32)
+OBSERVATIONS = {
+    "none": None,
+    "a dict": {"front": IMAGE},
+    "an array": IMAGE,
+    "cameras a list": Obs([IMAGE]),  # type: ignore[arg-type]
+    "state an array": Obs({}, state=STATE),  # type: ignore[arg-type]
+    "image none": Obs({"front": None}),  # type: ignore[dict-item]
+    "image a list": Obs({"front": [[1, 2], [3]]}),  # type: ignore[dict-item]
+    "state none": Obs(state={"q": None}),  # type: ignore[dict-item]
+    "state text": Obs(state={"q": "hello"}),  # type: ignore[dict-item]
+    "state texts": Obs(state={"q": ["a", "b"]}),  # type: ignore[dict-item]
+    "state ragged": Obs(state={"q": [[1, 2], [3]]}),  # type: ignore[dict-item]
+    "state a set": Obs(state={"q": {1, 2}}),  # type: ignore[dict-item]
+    "state complex": Obs(state={"q": np.zeros(6, complex)}),
+    "state an array of text": Obs(state={"q": np.array(["1", "2"])}),
+    "gripper text": Obs(gripper="open"),  # type: ignore[arg-type]
+    "info a list": Obs(info=[1]),  # type: ignore[arg-type]
+}
+
+
+@pytest.mark.parametrize("mistake", OBSERVATIONS)
+def test_what_is_no_observation_is_not_sent(mistake: str) -> None:
+    with pytest.raises(InvalidObservation, match=r"expected .*got "):
+        require_obs(OBSERVATIONS[mistake])
+
+
+def test_an_observation_may_hold_lists_and_other_numbers() -> None:
+    require_obs(Obs({"front": IMAGE}, 1, {"q": [1, 2.5], "w": np.arange(3), "b": np.ones(2, bool)}, {"a": [1]}))  # type: ignore[dict-item]
+    require_obs(Obs(gripper=np.float32(0.5)))  # type: ignore[arg-type]
