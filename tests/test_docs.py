@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 import runpy
+from collections.abc import Sequence
 from dataclasses import fields
 from pathlib import Path
 
@@ -11,7 +12,7 @@ import numpy as np
 import pytest
 import yaml
 from ray.serve.schema import ServeApplicationSchema
-from readme_blocks import PAGES, commands, read_as_typed
+from readme_blocks import PAGES, commands, options_of, read_as_typed
 from tables import section
 
 from vlagents_ray.cli.evaluate import read_run
@@ -65,6 +66,53 @@ def test_the_tests_that_a_page_names_exist(page: Path) -> None:
 def test_the_commands_on_a_page_are_such_as_the_command_line_takes(page: Path) -> None:
     for line, whole in commands(page.read_text()):
         read_as_typed(line, whole=whole)
+
+
+# Commands whose options a page explains without a line that begins with `vlagents-ray`.
+EXPLAINED = {
+    "checkpoints.md": ["eval"],
+    "gpu.md": ["eval"],
+    "install.md": ["eval"],
+    "kubernetes.md": ["eval"],
+    "learn.md": ["eval"],
+    "libero.md": ["eval"],
+    "live.md": ["serve"],
+    "measured.md": ["serve"],
+    "other_clients.md": ["serve"],
+    "own_policy.md": ["eval"],
+    "pi0.md": ["replay"],
+    "programs.md": ["robot"],
+    "slurm.md": ["serve"],
+    "troubleshooting.md": ["eval", "serve"],
+}
+OF_OTHERS = {  # options of sbatch, docker, ray, uv, of LeRobot's and GR00T's programs, and of the checkout's scripts
+    *("--account", "--array", "--mem", "--name", "--nodes", "--ntasks", "--qos", "--requeue"),
+    *("--build-context", "--health-cmd", "--ipc", "--memory", "--shm-size", "--target", "--temp-dir"),
+    *("--fps", "--use-sim-policy-wrapper"),
+    *("--chunk", "--dtype", "--help", "--max-lag", "--rows", "--size", "--steps", "--torchrl", "--whole"),
+}
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+def test_an_option_in_a_sentence_is_one_of_a_command_that_the_page_names(page: Path) -> None:
+    """`--episodes` in the text of `replay`, whose option is `--only`, sent readers to an error."""
+    explained = [f"vlagents-ray {command}" for command in EXPLAINED.get(page.name, [])]
+    assert unknown_options(page.read_text(), explained) == []
+
+
+def test_an_option_that_no_command_of_its_page_has_is_found() -> None:
+    text = "`vlagents-ray replay FOLDER` plays it. `--cameras a=b` maps names, `--only 3` selects"
+    assert unknown_options(text) == ["--cameras"]
+
+
+def unknown_options(text: str, explained: Sequence[str] = ()) -> list[str]:
+    """Return the options in sentences that no command on the page has, nor one of `explained`."""
+    named = [*explained, *(line for line, _ in commands(text))]
+    prose = re.sub(r"```.*?```", "", text, flags=re.DOTALL)
+    mentioned = [" ".join(code.split()) for code in re.findall(r"`([^`]*)`", prose)]
+    options = [code.partition(" ")[0].partition("=")[0] for code in mentioned if re.match(r"--\w[^. ]*( |=|$)", code)]
+    have = set().union(*(options_of(line) for line in named)) | OF_OTHERS
+    return [option for option in options if option not in have]
 
 
 @pytest.mark.parametrize(

@@ -261,3 +261,16 @@ def test_a_containers_memory_limit_is_what_counts(tmp_path: Path) -> None:
     assert doctor.memory_bytes(limit) == 1_000_000
     limit.write_text("max\n")
     assert doctor.memory_bytes(limit) == machines
+
+
+@pytest.mark.parametrize(("version", "status"), [((3, 10), "warn"), ((3, 11), "ok"), ((3, 12), "warn")])
+def test_a_python_that_is_not_supported_for_servers_is_a_warning(
+    version: tuple[int, int], status: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("sys.version_info", (*version, 1))
+    check = doctor.python_version()
+    assert check.status == status
+    assert (status == "ok") == ("3.11" not in check.cure)
+    root = Path(doctor.__file__).parents[2]
+    for page in ("README.md", "docs/install.md"):
+        assert "supported on Linux with Python 3.11" in " ".join((root / page).read_text().split())

@@ -32,6 +32,7 @@ from typing import Any
 from peer_environment import peers_python
 from typer.main import get_command
 
+from vlagents_ray.cli import robot, robot_check
 from vlagents_ray.cli.main import app
 
 ROOT = Path(__file__).parents[2]
@@ -193,6 +194,20 @@ def commands(text: str) -> list[tuple[str, bool]]:
     prose = re.sub(r"```.*?```", "", text, flags=re.DOTALL)
     mentioned = [" ".join(one.split()) for one in re.findall(r"`(vlagents-ray [^`]*)`", prose)]
     return [(line, True) for line in typed] + [(line, False) for line in mentioned]
+
+
+def options_of(line: str) -> set[str]:
+    """The options of the command that a line begins with, and of those below it."""
+    words = line.split()
+    words = words[words.index("vlagents-ray") + 1 :]
+    if words[:1] == ["robot"]:
+        parsers = [robot.command_parser()[0], robot_check.command_parser()]
+        return {option for parser in parsers for action in parser._actions for option in action.option_strings}
+    command = COMMAND
+    while words and words[0] in getattr(command, "commands", {}):
+        command = command.commands[words.pop(0)]
+    below = [command, *getattr(command, "commands", {}).values()]
+    return {option for one in below for parameter in one.params for option in parameter.opts}
 
 
 def read_as_typed(line: str, *, whole: bool) -> None:

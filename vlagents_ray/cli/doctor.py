@@ -66,6 +66,8 @@ for name in [name for name in ("torch", "jax") if name in installed]:
 print("\\n" + json.dumps(found))
 """
 
+SUPPORTED = (3, 11)  # the version of Python that the tests of servers run
+
 
 @dataclass(frozen=True, slots=True)
 class Check:
@@ -188,7 +190,7 @@ def run(console: Console, port: int = DEFAULT_PORT, pythons: Sequence[Path] = ()
 def checks(port: int = DEFAULT_PORT, pythons: Sequence[Path] = ()) -> Iterator[tuple[str, Check]]:
     """Yield names and results of all checks; `pythons` take the place of those that `env make` made in this folder."""
     todo: list[tuple[str, Callable[[], Check]]] = [
-        ("Python", lambda: Check("ok", f"{platform.python_version()} at {sys.executable}")),
+        ("Python", python_version),
         ("Ray", ray),
         ("HAProxy", haproxy),
         ("GPU", gpu),
@@ -262,6 +264,15 @@ def gpu() -> Check:
         why = _last_line(answer.stderr or answer.stdout)
         return Check("warn", f"nvidia-smi: {why}", "reload or reinstall the NVIDIA driver; a reboot often helps")
     return Check("ok", "; ".join(answer.stdout.strip().splitlines()))
+
+
+def python_version() -> Check:
+    """Check that this is the version of Python for which a server is supported."""
+    found = f"{platform.python_version()} at {sys.executable}"
+    if sys.version_info[:2] == SUPPORTED:
+        return Check("ok", found)
+    wanted = ".".join(map(str, SUPPORTED))
+    return Check("warn", f"{found}; servers are tested with Python {wanted}", f"make an environment of Python {wanted}")
 
 
 def libraries(python: Path) -> Iterator[tuple[str, Check]]:
