@@ -29,9 +29,15 @@ class Reach(Agent):
     def __init__(self, gain=0.5):
         self.gain = gain
 
+    def act(self, obs):
+        return Act(None)
+
 class Loaded(Agent):
     class Config(BaseModel):
         checkpoint: str
+
+    def act(self, obs):
+        return Act(None)
 """
 ENV = """
 from vlagents_ray.envs.tabletop import Tabletop

@@ -160,6 +160,9 @@ class Broken(Agent):
     def initialize(self) -> None:
         raise FileNotFoundError("no checkpoint here")
 
+    def act(self, obs: Obs) -> Act:
+        raise AssertionError("it does not load")
+
 
 class Accountant(Agent):
     """If it is to count, says what its process holds: descriptors, threads, mappings of clients' memory, bytes."""
