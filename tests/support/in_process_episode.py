@@ -10,7 +10,7 @@ import numpy as np
 from vlagents_ray.envs import EvalEnv
 from vlagents_ray.envs.base import SequentialBatch
 from vlagents_ray.errors import VLAgentsError
-from vlagents_ray.evaluate.episode.episode import run_episodes
+from vlagents_ray.evaluate.episode.episode import Diverged, run_episodes
 from vlagents_ray.evaluate.episode.records import EpisodeObserver, EpisodeResult
 from vlagents_ray.evaluate.plan.jobs import EpisodeKey
 from vlagents_ray.interface import Act, Agent, Obs
@@ -46,6 +46,8 @@ def run_episode(
     [outcome] = run_episodes(batch, agent, [agent], [key], **settings, observers=[observer], images=images)
     if isinstance(outcome, VLAgentsError):
         raise outcome
+    if isinstance(outcome, Diverged):
+        raise outcome.error
     return outcome
 
 

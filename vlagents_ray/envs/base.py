@@ -324,8 +324,15 @@ def make_batch(name: str, num_envs: int, **options: Any) -> BatchEnv:
         return SequentialBatch(envs)
 
 
+ERROR = "error"  # in the info of an environment whose step failed, beside others
+
+
 class SequentialBatch(BatchEnv):
-    """Environments that are stepped one after another, while one call of the policy serves all of them."""
+    """Environments that are stepped one after another, while one call of the policy serves all of them.
+
+    If the step of one of several environments raises an exception, such as `InvalidAction` for a refused action, it
+    stands as `ERROR` in its info, and the others are stepped: an episode does not depend on those beside it.
+    """
 
     restarts = True
 
@@ -363,17 +370,28 @@ class SequentialBatch(BatchEnv):
         if n > 1:  # a single environment checks its action itself
             for act in moving.values():
                 one_row(act, self.contract)
+        moved = set(moving)
         seen, rewards, terminated, truncated = list(self._seen), [0.0] * n, [False] * n, [False] * n
         infos: list[dict[str, Any]] = [{}] * n
         for i, act in moving.items():
-            self._envs[i].looked_at = self.looked_at
-            answer: Any = self._envs[i].step(act)
-            if not isinstance(answer, tuple) or len(answer) != 5:
-                want = "(Obs, reward, terminated, truncated, info)"
-                raise EnvFailed(f"env step: got {kind_of(answer)}, want {want}; see EvalEnv.step")
-            seen[i], rewards[i], terminated[i], truncated[i], infos[i] = answer
-        self._seen = self._stacked(seen, moving)
+            try:
+                seen[i], rewards[i], terminated[i], truncated[i], infos[i] = self._step_one(i, act)
+            except (Exception, SystemExit) as error:
+                if n == 1:
+                    raise
+                infos[i] = {ERROR: error}
+                moved.discard(i)
+        self._seen = self._stacked(seen, moved)
         return self._seen, rewards, terminated, truncated, infos
+
+    def _step_one(self, index: int, act: Act) -> tuple[Any, ...]:
+        env = self._envs[index]
+        env.looked_at = self.looked_at
+        answer: Any = env.step(act)
+        if not isinstance(answer, tuple) or len(answer) != 5:
+            want = "(Obs, reward, terminated, truncated, info)"
+            raise EnvFailed(f"env step: got {kind_of(answer)}, want {want}; see EvalEnv.step")
+        return answer
 
     def renderer(self) -> Renderer | None:
         return self._envs[0].renderer()

@@ -159,6 +159,7 @@ class _Run:
         self._checked_gpus = not config.workers  # when an env first drew
         earlier = {cell.cell: cell for cell in Results.load(config.out).cells}
         self._recorded = {cell: rate_of([results], "success_once") for cell, results in earlier.items()}
+        self._diverged: dict[EpisodeKey, tuple[int, str | None]] = {}  # steps and digest of the actions
         self._stopping: dict[str, Stopping] = {}
         if config.stop is not None:
             for cell in store.cells:
@@ -253,6 +254,8 @@ class _Run:
                 self._attempts.note_policy_error(report.result.error or "")
 
     def _failed(self, job: Job, failure: Failure) -> None:
+        if self._diverged_again(job, failure):
+            return
         beyond = self._has_stopped(job)  # it is no longer needed
         retried = self._attempts.repeats(job, failure) and not beyond
         self.store.record_attempt(job, failure, retried=retried)
@@ -267,6 +270,19 @@ class _Run:
         lost = EpisodeResult(job.key, "infra_failed", error=f"{failure.code}: {failure.message}")
         self._record(job, lost, Artifacts())
         self._attempts.note_lost(failure, "resume when this is mended (--resume)")
+
+    def _diverged_again(self, job: Job, failure: Failure) -> bool:
+        """Record a simulation that diverged twice under the same actions: the policy is the cause, and has failed."""
+        result = failure.diverged
+        if result is None:
+            return False
+        actions = (result.steps, result.actions_sha256)
+        if self._diverged.setdefault(job.key, actions) != actions or job.attempt == 1:
+            self._diverged[job.key] = actions
+            return False
+        self._record(job, result, Artifacts())
+        self._attempts.note_policy_error(result.error or "")
+        return True
 
     def _record(self, job: Job, result: EpisodeResult, kept: Artifacts) -> None:
         # Files first: a crash in between repeats the episode, and they are overwritten.

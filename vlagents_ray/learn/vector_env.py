@@ -8,7 +8,7 @@ from typing import Any, Literal, get_args
 import numpy as np
 
 from vlagents_ray.contract import Contract
-from vlagents_ray.envs.base import BatchEnv, make_batch
+from vlagents_ray.envs.base import ERROR, BatchEnv, make_batch
 from vlagents_ray.errors import ConfigError, InvalidAction, InvalidInput, NotReset
 from vlagents_ray.evaluate.episode.episode import options_of_reset
 from vlagents_ray.evaluate.episode.failures import checked_obs, checked_step, env_side
@@ -245,6 +245,8 @@ class BatchVectorEnv(vector.VectorEnv):  # type: ignore[misc]
         with env_side("step"):
             acts = [Act(row) if moves else None for row, moves in zip(rows, moving, strict=True)]
             seen, rewards, terminated, truncated, infos = self._batch.step(acts)
+            for error in (info[ERROR] for info in infos if ERROR in info):
+                raise error
         self._steps += moving
         outputs = [*zip(seen, rewards, terminated, truncated, infos, strict=True)]
         return [

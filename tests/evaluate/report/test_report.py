@@ -102,7 +102,7 @@ def test_names_are_text_wherever_they_are_shown(page: Read, tmp_path: Path) -> N
 
 
 def test_rates_stand_with_their_intervals(page: Read) -> None:
-    assert re.search(r"all base \d+ .*? learner@1000 35/36 25\.7 14\.2 to 42\.1 25\.7", page.words)
+    assert re.search(r"all base \d+ .*? learner@1000 35/36 25\.0 to 27\.8 25\.7 14\.2 to 42\.1 25\.7", page.words)
 
 
 def test_workers_are_counted_where_they_ran_by_transport_and_renderer(page: Read) -> None:

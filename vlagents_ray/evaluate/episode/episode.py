@@ -18,7 +18,7 @@ import numpy as np
 
 from vlagents_ray.client.agent import RemoteAgent
 from vlagents_ray.contract import Contract
-from vlagents_ray.envs.base import BatchEnv, Environment
+from vlagents_ray.envs.base import ERROR, BatchEnv, Environment
 from vlagents_ray.errors import CheckpointFailed, ConfigError, InvalidAction, PolicyFailed, VLAgentsError
 from vlagents_ray.evaluate.episode import failures
 from vlagents_ray.evaluate.episode.latency import ChunkExecutor, Tick
@@ -116,7 +116,17 @@ def _quantile(milliseconds: list[float], q: float) -> float | None:
 
 
 Phase = Literal["idle", "connect", "make", "env reset", "policy reset", "policy act", "env step"]
-Outcome = EpisodeResult | VLAgentsError
+
+
+@dataclass(frozen=True, slots=True)
+class Diverged:
+    """The outcome of an episode whose simulation diverged: its state or its reward is not a finite number."""
+
+    error: VLAgentsError
+    result: EpisodeResult  # if the policy is the cause, as the simulation diverges again under the same actions
+
+
+Outcome = EpisodeResult | VLAgentsError | Diverged
 Watch = Callable[[Phase, int], None]  # called with the phase that begins and the number of steps so far
 
 _ACTING, _STEPPING = failures.policy_side("act"), failures.env_side("step")  # entered at each step
@@ -158,12 +168,13 @@ def run_episodes(
 
     Returns:
         An outcome for each key. A policy error ends only its own episode, with status "policy_error". Where an episode
-        failed by another error, such as `PolicyUnavailable`, the error stands in place of the result.
+        failed by another error, such as `PolicyUnavailable`, the error stands in place of the result; `Diverged` if its
+        simulation diverged.
 
     Raises:
         ConfigError: The numbers of episodes and sessions differ, or there are fewer environments.
-        EnvFailed: The simulator broke, which ends all episodes.
-        InvalidAction: An action does not fit one of several environments.
+        EnvFailed: The simulator of all environments broke, which ends all episodes.
+        InvalidAction: An action does not fit one of several environments that one simulator runs.
     """
     if not len(keys) == len(sessions) <= env.num_envs or not keys:
         raise ConfigError(
@@ -276,11 +287,8 @@ class _Episode:
     def stepped(self, step: failures.EnvStep, limit: int) -> None:
         """Record that the next of `ticks` was executed; the episode may be over, also by the `limit` of steps."""
         self.observer.add_observation(step.obs)
-        self.obs, tick, stats = step.obs, self.ticks.popleft(), self.stats
-        stats.steps += 1
-        stats.ticks_waited += tick.waited
-        stats.ticks_held += tick.held
-        stats.actions.update(tick.action.astype(_LITTLE_ENDIAN, copy=False).tobytes())
+        self.obs, stats = step.obs, self.stats
+        tick = self._executed()
         stats.episode_return += step.reward
         stats.success = step.success
         if stats.success and stats.first_success is None:
@@ -292,6 +300,21 @@ class _Episode:
         if over:
             self.outcome = stats.result(transport_of(self.session))
         self.observer.add_action(tick.action, step.reward, step.success)
+
+    def _executed(self) -> Tick:
+        """Count the next of `ticks`, which the environment has executed, and return it."""
+        tick, stats = self.ticks.popleft(), self.stats
+        stats.steps += 1
+        stats.ticks_waited += tick.waited
+        stats.ticks_held += tick.held
+        stats.actions.update(tick.action.astype(_LITTLE_ENDIAN, copy=False).tobytes())
+        return tick
+
+    def diverged(self, error: VLAgentsError) -> None:
+        """End the episode, as the simulation diverged at the next of `ticks`."""
+        self._executed()
+        cause = PolicyFailed(f"the simulation diverged, and again under the same actions: {error}")
+        self.outcome = Diverged(error, self.stats.result(transport_of(self.session), cause))
 
     def failed(self, error: VLAgentsError) -> None:
         if isinstance(error, PolicyFailed) and not isinstance(error, CheckpointFailed):
@@ -360,14 +383,25 @@ def _step(env: BatchEnv, episodes: Sequence[_Episode], playing: Sequence[_Episod
             seen, rewards, terminated, truncated, infos = env.step(acts)
             answers = list(zip(episodes, seen, rewards, terminated, truncated, infos, strict=True))
     except InvalidAction as error:
-        if len(playing) > 1:  # the error does not name the episode
+        if len(playing) > 1:  # of environments that one simulator runs: the error does not name the episode
             raise
         playing[0].failed(error)
         return
     took_ms = 1e3 * (perf_counter() - begun)
     for episode, obs, reward, terminated, truncated, info in answers:
         if episode.outcome is None:
-            step = failures.checked_step(obs, reward, terminated, truncated, info, contract, images=env.looked_at)
+            raised = info.get(ERROR) if isinstance(info, Mapping) else None
+            try:
+                with _STEPPING:
+                    if isinstance(raised, BaseException):
+                        raise raised
+                step = failures.checked_step(obs, reward, terminated, truncated, info, contract, images=env.looked_at)
+            except VLAgentsError as error:
+                if raised is None and not failures.is_finite(obs, reward):
+                    episode.diverged(error)
+                else:
+                    episode.failed(error)
+                continue
             episode.stats.step_ms.append(took_ms)
             episode.stepped(step, env.max_steps)
 

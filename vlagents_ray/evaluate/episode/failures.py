@@ -18,6 +18,7 @@ import numpy as np
 
 from vlagents_ray import errors
 from vlagents_ray.contract import Contract
+from vlagents_ray.evaluate.episode.records import EpisodeResult
 from vlagents_ray.interface import Obs
 from vlagents_ray.validation import check_observation
 
@@ -62,6 +63,7 @@ class Failure:
     message: str
     traceback: str = ""
     log: str = ""  # the end of the worker's log, if it broke
+    diverged: EpisodeResult | None = None  # if the simulation diverged: the result if the policy is the cause
 
 
 def explain(error: errors.VLAgentsError) -> Failure:
@@ -122,6 +124,15 @@ class EnvStep(NamedTuple):
     success: bool
 
 
+def is_finite(obs: object, reward: object) -> bool:
+    """Return whether the numbers of a step's outputs are finite; those of a diverged simulation are not."""
+    values: list[Any] = [reward]
+    if isinstance(obs, Obs):
+        values += [*obs.state.values(), 0 if obs.gripper is None else obs.gripper]
+    arrays = [np.asarray(value) for value in values]
+    return all(np.isfinite(array).all() for array in arrays if array.dtype.kind == "f")
+
+
 def checked_instruction(instruction: object, where: str) -> str:
     """Return `instruction`; raises `EnvFailed` if it is not text."""
     if not isinstance(instruction, str):
@@ -173,8 +184,7 @@ def checked_obs(obs: object, contract: Contract, where: str, *, images: bool = T
     try:
         check_observation(obs, contract if images else replace(contract, cameras=None))
     except errors.InvalidObservation as error:
-        numbers = [*map(np.asarray, obs.state.values()), np.asarray(0 if obs.gripper is None else obs.gripper)]
-        if not all(np.isfinite(part).all() for part in numbers if part.dtype.kind == "f"):
+        if not is_finite(obs, 0.0):
             wrong = errors.EnvFailed
         raise wrong(f"env {where}: the observation does not fit the env's own contract: {error}") from error
     except TypeError as error:  # such as a gripper that is not a number

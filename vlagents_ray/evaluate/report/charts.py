@@ -33,6 +33,14 @@ def interval(rate: Rate) -> str:
     return f"{100 * low:.1f} to {100 * high:.1f}"
 
 
+def bounds(values: tuple[float, float] | None) -> str:
+    """Return (low, high) in per cent."""
+    if values is None:
+        return NONE
+    low, high = values
+    return f"{100 * low:.1f} to {100 * high:.1f}"
+
+
 def interval_name(rate: Rate) -> str:
     """Return the kind of that interval: a confidence sequence if cells could stop early, else Wilson's."""
     if rate.error_rate is None:

@@ -131,7 +131,18 @@ def _templates() -> Environment:
     # Names and errors are foreign text, so every value in a template is escaped.
     loader = PackageLoader(__package__ or "")
     env = Environment(loader=loader, autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True)
-    formats = ("duration", "interval", "interval_name", "moment", "number", "p_value", "percent", "points", "quantity")
+    formats = (
+        "bounds",
+        "duration",
+        "interval",
+        "interval_name",
+        "moment",
+        "number",
+        "p_value",
+        "percent",
+        "points",
+        "quantity",
+    )
     env.filters.update({name: getattr(charts, name) for name in formats})
     env.filters.update(interval_glyph=charts.interval_glyph, px=charts.px, json=partial(json.dumps, ensure_ascii=False))
     env.globals.update(PLOT=charts.PLOT, AT_ONCE=AT_ONCE, NONE=charts.NONE, MINUS=charts.MINUS)

@@ -35,6 +35,7 @@ class SuccessTable:
     several: bool  # policy ids
     stopped: int | None  # cells that stopped early; None: none could
     pooled: bool  # every policy has one rate for all its cells
+    some_lost: bool  # infrastructure kept episodes from ending
 
 
 @dataclass(frozen=True, slots=True)
@@ -53,6 +54,7 @@ def success_table(summary: Summary) -> SuccessTable:
         len(summary.results.contenders) > 1,
         None if total.success_once.bounds is None else total.stopped,
         all(part.success_once.pooled for part in parts),
+        total.infra_failures > 0,
     )
 
 

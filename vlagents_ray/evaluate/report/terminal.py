@@ -212,14 +212,16 @@ def results_table(summary: Summary) -> Table:
     if len(names) > 1:
         table.add_column("policy", overflow="fold")
     table.add_column("env", overflow="fold")
-    for title in ("episodes", "once", "at end", "steps", "policy ms", "env ms"):
+    some_lost = summary.total.infra_failures > 0
+    rates = ("once", "once with lost", "at end") if some_lost else ("once", "at end")
+    for title in ("episodes", *rates, "steps", "policy ms", "env ms"):
         table.add_column(title, justify="right", no_wrap=True)
     for name, total in zip(names, summary.totals, strict=True):
         groups = [(group, "") for group in summary.cells if group.contender == name]
         parts = summary.parts(name)
         totals = [(total, "")] if len(parts) == 1 else [(part, timing) for timing, part in parts.items()]
         for group, timing in [*groups, *totals] if len(groups) > 1 else groups:
-            table.add_row(*([name] if len(names) > 1 else []), *_cells(group, timing))
+            table.add_row(*([name] if len(names) > 1 else []), *_cells(group, timing, some_lost=some_lost))
         table.add_section()
     return table
 
@@ -258,6 +260,7 @@ def print_summary(console: Console, summary: Summary) -> None:
         lines.append(f"{total.retries} attempts lost to infrastructure and repeated")
     if total.infra_failures:
         lines.append(f"{total.infra_failures} episodes lost to infrastructure, in no rate; --resume tries them again")
+        lines.append("once with lost: the bounds if all lost episodes had failed, or had been solved")
     lines += [f"accepted change: {change}" for change in summary.results.accepted_changes]
     pushed = {cell.contender: words for cell in summary.results.cells if (words := pushed_of(cell)) is not None}
     lines += [f"{name}: weights pushed by a learner, {words}" for name, words in pushed.items()]
@@ -286,11 +289,13 @@ def print_summary(console: Console, summary: Summary) -> None:
         console.print(line, markup=False, highlight=False, soft_wrap=True)
 
 
-def _cells(group: Group, timing: str) -> list[str]:
+def _cells(group: Group, timing: str, *, some_lost: bool) -> list[str]:
+    bounds = group.with_lost(group.success_once)
     return [
         " ".join(filter(None, (group.suite, group.env, timing))),
         f"{group.episodes}/{group.planned}",
         str(group.success_once),
+        *(["-" if bounds is None else f"{100 * bounds[0]:.0f} to {100 * bounds[1]:.0f}%"] if some_lost else []),
         "-" if group.success_at_end.rate is None else f"{group.success_at_end.rate:.0%}",
         _number(group.mean_steps),
         _number(group.policy_ms, 2),

@@ -51,10 +51,24 @@ class Group:
         """The number of finished episodes."""
         return self.success_once.episodes
 
+    def with_lost(self, rate: Rate) -> tuple[float, float] | None:
+        """Return the bounds of one of the rates with lost episodes: all of them failures, or all successes.
+
+        Losses may depend on the policy, such as those of a simulator that its actions break.
+
+        Returns:
+            (low, high) in [0, 1]; None if no episode was lost, or the episodes have no common rate.
+        """
+        if not self.infra_failures or not rate.pooled:
+            return None
+        planned = rate.episodes + self.infra_failures
+        return rate.successes / planned, (rate.successes + self.infra_failures) / planned
+
     def to_json(self) -> dict[str, Any]:
-        """Return the fields for JSON, with `episodes`."""
+        """Return the fields for JSON, with `episodes`, and the bounds `with_lost` of each rate."""
         rates = {"success_once": self.success_once.to_json(), "success_at_end": self.success_at_end.to_json()}
-        return asdict(self) | {"episodes": self.episodes} | rates
+        lost = {name: self.with_lost(getattr(self, name)) for name in rates}
+        return asdict(self) | {"episodes": self.episodes} | rates | {"with_lost": lost}
 
 
 @dataclass(frozen=True, slots=True)

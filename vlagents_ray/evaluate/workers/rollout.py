@@ -177,12 +177,16 @@ class Rollout:
                 watch=self._set_phase,
                 images=wanted == "all" or (wanted == "failures" and self._renders_at_once(agent, env, cell.policy)),
             )
-            return [
-                Report(result=one, artifacts=self._finished(env, job, one, recording))
-                if isinstance(one, EpisodeResult)
-                else Report(failure=explain(one))
-                for job, one, recording in zip(jobs, outcomes, recordings, strict=True)
-            ]
+            reports = []
+            for job, outcome, recording in zip(jobs, outcomes, recordings, strict=True):
+                if isinstance(outcome, EpisodeResult):
+                    report = Report(result=outcome, artifacts=self._finished(env, job, outcome, recording))
+                elif isinstance(outcome, episode.Diverged):
+                    report = Report(failure=replace(explain(outcome.error), diverged=outcome.result))
+                else:
+                    report = Report(failure=explain(outcome))
+                reports.append(report)
+            return reports
 
     def _finished(self, env: BatchEnv, job: Job, result: EpisodeResult, recording: EpisodeRecorder) -> Artifacts:
         """Return the artifacts of an episode; if images are missing, play it again."""
