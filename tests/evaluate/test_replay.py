@@ -17,9 +17,10 @@ from vlagents_ray.errors import ConfigError
 from vlagents_ray.evaluate import EvalConfig, Results, evaluate
 from vlagents_ray.evaluate.episode.records import EpisodeResult
 from vlagents_ray.evaluate.exports import tables
+from vlagents_ray.evaluate.merge import merge
 from vlagents_ray.evaluate.plan.cases import cells
 from vlagents_ray.evaluate.plan.config import PushedWeights
-from vlagents_ray.evaluate.replay import compare, find
+from vlagents_ray.evaluate.replay import ROUNDING, compare, find, rounding
 from vlagents_ray.evaluate.results.store import Store
 from vlagents_ray.interface import Act, Obs
 
@@ -76,6 +77,56 @@ def test_without_a_trajectory_it_is_said_that_the_actions_differ(
         trajectory.unlink()
     first, *_ = again(results, f"{LINE}#1", tmp_path / "again", Noisy)
     assert re.match(rf"actions: they differ; from which step on is not known{why}", first)
+
+
+class Rounded(ToZero):
+    """Differs from the recorded policy in its third action, as in a batch of another size."""
+
+    def __init__(self, difference: float) -> None:
+        super().__init__()
+        self._difference, self._acts = difference, 0
+
+    def act(self, obs: Obs) -> Act:
+        self._acts += 1
+        act = super().act(obs)
+        return Act(act.action + np.float32(self._difference)) if self._acts == 3 else act
+
+
+@pytest.mark.parametrize(("difference", "is_rounding"), [(1e-6, True), (2e-6, True), (1e-3, False), (0.1, False)])
+def test_rounding_is_told_from_another_action(
+    config: Config, tmp_path: Path, difference: float, is_rounding: bool
+) -> None:
+    recorded = find(play(config(episodes=1, record="all")), f"{LINE}#0")
+    replayed = play(recorded.config(tmp_path / "again"), lambda: Rounded(difference))
+    largest = rounding(recorded, replayed)
+    assert largest is not None
+    assert largest > 0
+    assert (largest <= ROUNDING) is is_rounding
+    assert (compare(recorded, replayed) == []) is is_rounding
+
+
+def test_the_same_actions_have_no_rounding_and_without_a_recording_it_is_unknown(
+    config: Config, tmp_path: Path
+) -> None:
+    recorded = find(play(config(episodes=1, record="all")), f"{LINE}#0")
+    assert rounding(recorded, play(recorded.config(tmp_path / "same"))) == 0
+    unrecorded = find(play(config(episodes=1, out=tmp_path / "other")), f"{LINE}#0")
+    replayed = play(unrecorded.config(tmp_path / "again"), lambda: Rounded(1e-6))
+    assert rounding(unrecorded, replayed) is None
+    assert "nor whether by more than rounding" in compare(unrecorded, replayed)[0]
+
+
+def test_an_episode_is_replayed_after_a_merge_that_renamed_its_suite(config: Config, tmp_path: Path) -> None:
+    renamed = config(out=tmp_path / "b", seed=100, episodes=1)
+    suite = renamed.suites[0].model_copy(update={"name": "b"})
+    play(renamed.model_copy(update={"suites": [suite]}))
+    play(config(out=tmp_path / "a", episodes=1))
+    results = merge(tmp_path / "all", [tmp_path / "a", tmp_path / "b"]).results
+    for number, episode in enumerate(results.cells[0].episodes):
+        recorded = find(results, str(episode.result.key))
+        replayed = play(recorded.config(tmp_path / f"again{number}"), left_out=[])
+        played = [one.result.key for one in replayed.cells[0].episodes]
+        assert episode.result.key in played
 
 
 class Tired(Noisy):

@@ -235,7 +235,7 @@ def replay_command(
             raise ConfigError(f"{folder}: holds results, and wants an episode: its key, or ENV#NUMBER")
         from vlagents_ray.cli.evaluation import play_one
         from vlagents_ray.evaluate import Results
-        from vlagents_ray.evaluate.replay import compare, find
+        from vlagents_ray.evaluate.replay import compare, find, rounding
 
         recorded = find(Results.load(folder), episode)
         other: dict[str, Any] | None = (
@@ -244,7 +244,14 @@ def replay_command(
         into = out_dir or fresh(folder / "replays" / "replay")
         summary = play_one(recorded.config(into, policy=other), address, recorded.number_and_seed)
         found = compare(recorded, summary.results)
-        same = f"the same: {recorded.episode.result.steps} actions byte for byte, and what came of them"
+        largest = rounding(recorded, summary.results)
+        steps = recorded.episode.result.steps
+        same = f"the same: {steps} actions byte for byte, and what came of them"
+        if largest:
+            same = (
+                f"the same up to rounding: {steps} actions that differ by at most {largest:.2g}, as in batches of "
+                f"another size, and what came of them"
+            )
         for line in [*(found or [same]), f"replay: {into}"]:
             out.print(line)
     raise typer.Exit(bool(found))

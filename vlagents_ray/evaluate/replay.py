@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -15,6 +16,7 @@ from vlagents_ray.evaluate.plan.config import EvalConfig
 from vlagents_ray.evaluate.results.reader import CellResults, Episode, Results
 
 _FEW = 5  # names in a message
+ROUNDING = 1e-5  # of an action of 1 or less, else relative: more than a batch of another size changes, about 1e-7
 
 
 @dataclass(frozen=True, slots=True)
@@ -37,8 +39,13 @@ class Recorded:
         """
         run = next(run for run in self.results.runs if run.run == self.episode.run)
         config = EvalConfig.model_validate(run.config)
-        where = (self.cell.contender, self.cell.suite, self.cell.env)
-        cell = next(one for one in cells(config) if one.name == where)
+        # By its settings: `merge` may have taken the suite's name from another folder.
+        cell = next((one for one in cells(config) if one.fingerprint == self.cell.cell), None)
+        if cell is None:
+            raise ConfigError(
+                f"{self.results.out}: the settings of run {run.run} have no such cell as that of "
+                f"{self.episode.result.key}; replay it in the folder in which it was played"
+            )
         given = cell.policy.model_dump() | {"steps": [cell.step] if cell.policy.steps else []}
         if cell.policy.source is None:
             given |= {"config": {}}  # the server has its own configuration
@@ -74,20 +81,26 @@ def find(results: Results, name: str) -> Recorded:
 
 
 def compare(recorded: Recorded, replayed: Results) -> list[str]:
-    """Return the differences of the replay, a sentence each; empty if it is the same episode.
+    """Return the differences of the replay, a sentence each; empty if it is the same episode up to rounding.
 
-    Actions are compared byte for byte, durations not at all. Raises `ConfigError` if infrastructure failed the replay.
+    Actions that differ in their bytes are the same if no number differs by more than `ROUNDING` (see `rounding`), and
+    so are then their returns. Durations are not compared. Raises `ConfigError` if infrastructure failed the replay.
     """
     [[again]] = [cell.episodes for cell in replayed.cells]
     if again.result.status == "infra_failed":
         raise ConfigError(f"the replay did not end, so that there is nothing to compare: {again.result.error}")
     before, now = recorded.episode.result.outcome, again.result.outcome
+    rounded = rounding(recorded, replayed)
+    is_rounding = rounded is not None and 0 < rounded <= ROUNDING
+    returns = before["episode_return"], now["episode_return"]
+    if is_rounding and math.isclose(*returns, rel_tol=ROUNDING, abs_tol=ROUNDING):
+        now = now | {"episode_return": before["episode_return"]}
     found = [
         f"{name}: {before[name]!r} was recorded, now it is {now[name]!r}"
         for name in before
         if before[name] != now[name] and name not in ("key", "actions_sha256")
     ]
-    if before["actions_sha256"] != now["actions_sha256"]:
+    if before["actions_sha256"] != now["actions_sha256"] and not is_rounding:
         found.insert(0, _actions(recorded, replayed.file(str(again.trajectory))))
     weights = [one.result.weights for one in (recorded.episode, again)]
     if found and None not in weights and weights[0] != weights[1]:
@@ -97,11 +110,33 @@ def compare(recorded: Recorded, replayed: Results) -> list[str]:
     return found
 
 
+def rounding(recorded: Recorded, replayed: Results) -> float | None:
+    """Return the largest difference of a number of an action, in units of the number if that is above 1.
+
+    Returns:
+        0 if the actions are equal byte for byte; None if their numbers differ, or a trajectory is missing.
+    """
+    [[again]] = [cell.episodes for cell in replayed.cells]
+    if recorded.episode.result.actions_sha256 == again.result.actions_sha256:
+        return 0.0
+    paths = [
+        None if one.trajectory is None else results.file(one.trajectory)
+        for results, one in ((recorded.results, recorded.episode), (replayed, again))
+    ]
+    if not all(path is not None and path.is_file() for path in paths):
+        return None
+    before, now = (Trajectory.load(path).actions.astype(np.float64) for path in paths if path is not None)
+    if before.shape != now.shape:
+        return None
+    return float(np.max(np.abs(before - now) / np.maximum(1.0, np.abs(before)), initial=0.0))
+
+
 def _actions(recorded: Recorded, replayed: Path) -> str:
     if (path := recorded.episode.trajectory) is None:
         return (
-            "actions: they differ; from which step on is not known, as no trajectory was recorded "
-            "(eval --record all, or `record: all` in its file)"
+            "actions: they differ; from which step on is not known, nor whether by more than rounding, as no "
+            "trajectory was recorded (eval --record all, or `record: all` in its file); the size of a batch, which "
+            "several episodes share, changes the last digits of an action, about 1e-7"
         )
     file = recorded.results.file(path)
     if not file.is_file():

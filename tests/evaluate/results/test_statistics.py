@@ -67,6 +67,11 @@ def test_mcnemar_agrees_with_published_values() -> None:
     assert mcnemar(1, 7, mid=True) == pytest.approx(0.039, abs=5e-4)
 
 
+def test_mid_p_of_a_tie_counts_half_of_the_observed_table() -> None:
+    assert mcnemar(5, 5, mid=True) == pytest.approx(1 - 252 / 1024 / 2)
+    assert (mcnemar(5, 5), mcnemar(0, 0, mid=True)) == (1.0, 1.0)
+
+
 @given(COUNTS, COUNTS)
 def test_mid_p_is_symmetric_and_no_larger(only_a: int, only_b: int) -> None:
     mid = mcnemar(only_a, only_b, mid=True)

@@ -168,6 +168,8 @@ def mcnemar(only_a: int, only_b: int, *, mid: bool = False) -> float:
     for k in range(min(only_a, only_b)):
         ways = ways * (n - k) // (k + 1)
         tail += ways
+    if mid and n and only_a == only_b:  # both tails contain the observed table, of which half is counted
+        return 1.0 - ways / (2 << n)
     return min(1.0, (2 * tail - ways * mid) / (1 << n))
 
 
