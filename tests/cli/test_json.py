@@ -60,7 +60,7 @@ def test_what_a_script_reads_is_json(tmp_path: Path, monkeypatch: pytest.MonkeyP
     assert [one["name"] for one in said["envs"]] == ["tabletop"]
     assert said["doctor"] == [{"check": "Ray", "status": "fail", "detail": "none", "cure": "install it"}]
     (pair,) = said["report"]["comparisons"]
-    assert (pair["a"], pair["b"], pair["lines"][-1]["suite"]) == ("a", "b", "all")
+    assert (pair["a"], pair["b"], pair["lines"][-1]["suite"]) == ("b", "a", "all")  # as on the page
     assert sum(cell["episodes"] for cell in said["report"]["cells"]) == 4
     assert not (out / "report.html").exists()
     assert said["verify"]["holds"] is True

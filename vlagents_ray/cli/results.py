@@ -159,7 +159,7 @@ def verify_command(
     seed: Annotated[
         int | None,
         typer.Option(
-            min=0, max=2**63 - 1, help="Draw those episodes by this seed; default: a new one, which is printed."
+            min=0, max=2**32 - 1, help="Draw those episodes by this seed; default: a new one, which is printed."
         ),
     ] = None,
     into: Annotated[Path | None, typer.Option("--out", help="Keep its results in this new folder.")] = None,
