@@ -44,7 +44,8 @@ class Admission:
     """The bytes in flight of one replica, and the threads that decode large messages. Thread-safe."""
 
     def __init__(self, in_flight_bytes: int) -> None:
-        self._limit = in_flight_bytes
+        # Number of bytes in flight that all messages may take together, by whether it is a robot's that needs more.
+        self._most = {True: in_flight_bytes, False: int(in_flight_bytes * (1 - _ROBOTS_SHARE))}
         self.held = 0  # number of bytes in flight
         self.messages: dict[weakref.ref[Any], int] = {}  # bytes to release with each message that has no admission
         self._held_by: Counter[str] = Counter()  # number of bytes in flight by the name of their key
@@ -68,7 +69,7 @@ class Admission:
             Overloaded: The bytes in flight leave no room at the moment.
             MessageTooLarge: The message alone exceeds the limit.
         """
-        most = self._most(robot)
+        most = self._most[robot]
         alone = most if key is None else int(most * _KEYS_SHARE)
         if message_bytes + size > alone:
             raise MessageTooLarge(
@@ -77,10 +78,12 @@ class Admission:
             )
         given_up: list[ArrivingBytes] = []
         with self._lock:
-            while size > self._room(most, key) and (arriving := self._largest_arriving(size, most, robot, key)):
+            room = self._room(most, key)
+            while size > room and (arriving := self._largest_arriving(size, most, robot, key)):
                 self._resize(arriving, 0)
                 given_up.append(arriving)
-            held, has_room = self.held, size <= self._room(most, key)
+                room = self._room(most, key)
+            held, has_room = self.held, size <= room
             if has_room:
                 self._count(size, key)
         for arriving in given_up:
@@ -99,7 +102,7 @@ class Admission:
 
     def resize(self, arriving: ArrivingBytes, size: int) -> None:
         """Count `size` bytes of incomplete messages in place of those counted before; raise `Overloaded`."""
-        most = self._most(arriving.robot)
+        most = self._most[arriving.robot]
         with self._lock:
             more = size - self._arriving.get(arriving, 0)
             has_room = more <= 0 or more <= self._room(most, arriving.key)
@@ -107,9 +110,6 @@ class Admission:
                 self._resize(arriving, size)
         if not has_room:
             raise Overloaded("the messages in flight leave no room for one that arrives slowly; send it again")
-
-    def _most(self, robot: bool) -> int:
-        return self._limit if robot else int(self._limit * (1 - _ROBOTS_SHARE))
 
     def _room(self, most: int, key: str | None) -> int:
         """Return how many bytes a sender may take; the caller holds the lock."""

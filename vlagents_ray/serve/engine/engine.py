@@ -312,7 +312,8 @@ class Engine:
             if (step := request.step) is not None and step > session.steps and step > session.expected:
                 raise session.wrong_step(step)
             if pending.episode is None:
-                pending.episode = self._episode_of(pending, session)
+                known = origin.sessions.get(pending.session_id)
+                pending.episode = self._latest_episode(pending, session) if known is None else known
             session.origin = origin
             if (model := session.model) is not None:  # another thread may set it to None
                 model.check(request)
@@ -331,15 +332,12 @@ class Engine:
         if origin.owner and request.op != "close":
             self._bind(pending)
 
-    def _episode_of(self, pending: PendingRequest, session: Session[LoadedModel]) -> int:
-        """Return the step at which the episode began that an act without a step belongs to.
+    def _latest_episode(self, pending: PendingRequest, session: Session[LoadedModel]) -> int:
+        """Return the step at which the episode began that an act belongs to whose connection has none.
 
-        That is the episode which the connection has last reset or acted in, otherwise the session's latest one. An act
-        that waited for a search of its session does not belong to an episode that began meanwhile.
+        That is the session's latest one. An act that waited for a search of its session does not belong to an episode
+        that began meanwhile.
         """
-        known = pending.origin.sessions.get(pending.session_id)
-        if known is not None:
-            return known
         if pending.sought and session.began >= pending.arrived and pending.request.step is None:
             raise session.wrong_episode()
         return session.expected

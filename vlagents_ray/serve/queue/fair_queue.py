@@ -109,7 +109,7 @@ class FairQueue:
             Finished requests are dropped.
         """
         lone = self._lone
-        if lone is not None and not lone.is_abandoned and now <= lone.deadline:
+        if lone is not None and not (lone.over or lone.origin.ended) and now <= lone.deadline:
             self._lone = None
             lone.begun = True
             self.depth[lone.rank] = self.size = 0
