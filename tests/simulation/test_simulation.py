@@ -134,7 +134,14 @@ def deadlines_begin_anew(replica: Replica) -> None:
 
 def forget_episodes(replica: Replica) -> None:
     """An act without a step is for whatever episode its session is in when the policy is free."""
-    replica.engine._episode_of = lambda *_: None  # type: ignore[method-assign,return-value]
+    check = replica.engine.check
+
+    def check_and_forget(pending: PendingRequest) -> None:
+        check(pending)
+        if pending.request.op == "act":
+            pending.episode = None
+
+    replica.engine.check = check_and_forget  # type: ignore[method-assign]
     replica.engine._user_of = lambda pending, *_: pending.origin  # type: ignore[method-assign]
 
 
