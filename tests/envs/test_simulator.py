@@ -26,6 +26,7 @@ PROTOCOL = BenchmarkProtocol(
     control_hz=20.0,
     control="joints",
     success="it is on the shelf",
+    metric="success_once",
     begins="the seed's",
     ends_on_success=True,
 )

@@ -7,7 +7,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Collection, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
 import numpy as np
 
@@ -24,6 +24,9 @@ if TYPE_CHECKING:
     from typing_extensions import Self
 
 Options = Mapping[str, Any]
+Metric = Literal[
+    "success_once", "success_at_end"
+]  # the success of an episode: after any of its steps, or after the last
 Steps = tuple[list[Obs], list[float], list[bool], list[bool], list[dict[str, Any]]]
 
 

@@ -69,6 +69,7 @@ _PUSHT = Known(
         control_hz=10.0,
         control="absolute position",
         success="the block covers more than 95 % of the target",
+        metric="success_once",
         begins="where agent and block stand: the seed's; episode i has the first seed + i",
         ends_on_success=True,
         episodes=50,
@@ -88,6 +89,7 @@ _FETCH = BenchmarkProtocol(
     control_hz=25.0,
     control="position of the gripper, delta",
     success="gripper or object is within 5 cm of the target after the last step: success_at_end",
+    metric="success_at_end",
     begins="where object and target are: the seed's",
     ends_on_success=False,
 )

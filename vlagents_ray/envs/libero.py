@@ -124,7 +124,9 @@ class LiberoProtocol:
             for f in fields(self)
             if getattr(self, f.name) != getattr(published, f.name)
         ]
-        plain: dict[str, Any] = json.loads(json.dumps(asdict(self) | {"deviations": deviations}))
+        plain: dict[str, Any] = json.loads(
+            json.dumps(asdict(self) | {"metric": "success_once", "deviations": deviations})
+        )
         return plain
 
 

@@ -27,6 +27,7 @@ PROTOCOL = BenchmarkProtocol(
     control_hz=80.0,
     control="position of the hand, delta",
     success="the task is solved after any step: success_once",
+    metric="success_once",
     begins="where the object and the goal are: the episode's seed, or one of the 50 states that MT1 draws",
     ends_on_success=True,
     episodes=50,

@@ -114,6 +114,7 @@ def protocol(task: str, split: Split) -> BenchmarkProtocol:
         control_hz=CONTROL_HZ,
         control="pose of the hand, delta, by OSC_POSE: 0.05 m and 0.5 rad a unit; velocity of the base",
         success="RoboCasa's own check of the task holds after a step",
+        metric="success_once",
         begins=f"{_KITCHENS[split]}, and where everything stands and lies in it: the seed's",
         ends_on_success=True,  # as in openpi's evaluation; GR00T's checks success at the end of each chunk of 16 steps
         episodes=50,

@@ -172,6 +172,7 @@ class RobosuiteTask:
             control_hz=CONTROL_HZ,
             control="pose of the hand, delta, by OSC_POSE: 0.05 m and 0.5 rad a unit",
             success="robosuite's own check of the task holds after a step",
+            metric="success_once",
             begins="where the objects lie, and noise on the arm's joints: the seed's",
             ends_on_success=True,
             episodes=50,

@@ -42,6 +42,7 @@ _DOWNLOADS = " && ".join(f"python -m mani_skill.utils.download_asset {name}" for
 PROTOCOL: dict[str, Any] = {
     "setting": "visual matching",
     "success": "at the end",  # in the last state; success at any step is also reported
+    "metric": "success_at_end",
     "initial_states": "by episode id",
     "control_mode": "arm_pd_ee_target_delta_pose_align2_gripper_pd_joint_pos",
     "obs_mode": "rgb+segmentation",

@@ -14,7 +14,7 @@ from typing import Any, ClassVar
 import numpy as np
 
 from vlagents_ray.contract import Contract
-from vlagents_ray.envs.base import EvalEnv, Options, one_row, require_cameras, require_known
+from vlagents_ray.envs.base import EvalEnv, Metric, Options, one_row, require_cameras, require_known
 from vlagents_ray.envs.graphics import EGL_CURE, egl_probe, prepare_rendering, vulkan_cure
 from vlagents_ray.errors import ConfigError, EnvFailed, NotReset, VLAgentsError
 from vlagents_ray.interface import Act, Obs
@@ -33,6 +33,7 @@ class BenchmarkProtocol:
     control_hz: float
     control: str  # the quantity that an action commands
     success: str  # the condition under which an episode counts as solved
+    metric: Metric  # whether it must hold after any step, or after the last one
     begins: str  # the effect of an episode's seed and initial state
     ends_on_success: bool
     episodes: int | None = None  # episodes per task in published tables; None if they differ

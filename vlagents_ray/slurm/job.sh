@@ -5,6 +5,13 @@ set -uo pipefail
 stopped=
 trap 'stopped=1' TERM INT  # Slurm sends them to all of a job's processes: the command ends in order by itself
 
+# Each signal ends `wait`, but not the process: Slurm may send several, and the command is still writing its results.
+wait_for() {
+  wait "$1"
+  while kill -0 "$1" 2>/dev/null; do wait "$1"; done
+  wait "$1"
+}
+
 logs=$folder/$SLURM_JOB_ID
 mkdir -p -m 700 "$logs"  # the user's alone: it has the token, keys and logs
 arguments=("${arguments[@]//%a/${SLURM_ARRAY_TASK_ID:-%a}}")
@@ -26,10 +33,10 @@ wait -n "$ray" "$command"
 if [ -z "$stopped" ] && ! kill -0 "$ray" 2>/dev/null && kill -TERM "$command" 2>/dev/null; then
   echo "Ray ended before the command; why is in $logs/ray-*.log" >&2
 fi
-wait "$command"
+wait_for "$command"
 status=$?
 scancel --signal=TERM "$SLURM_JOB_ID.0" 2>/dev/null  # a signal to srun would kill the step before it has cleaned up
-wait "$ray"
+wait_for "$ray"
 rm -f "$RAY_AUTH_TOKEN_PATH"
 
 # Out of time: the same job once more, with the same number, so that jobs that depend on it go on waiting.

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable
+from dataclasses import MISSING, fields
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +14,9 @@ from eval_fakes import LINE
 from pydantic import ValidationError
 from recorded_results import record, runs
 
+from vlagents_ray.envs import aloha, calvin, gymnasium, maniskill, metaworld, simpler
 from vlagents_ray.envs.libero import LiberoProtocol
+from vlagents_ray.envs.simulator import BenchmarkProtocol
 from vlagents_ray.errors import ConfigError
 from vlagents_ray.evaluate import EvalConfig, Results
 from vlagents_ray.evaluate.episode.records import EnvInfo, EpisodeResult
@@ -68,6 +72,49 @@ def test_the_hub_gets_an_entry_for_each_benchmark_with_all_that_pools_it(
         "c" * 40,
     ):
         assert fact in entries[0]["notes"]
+
+
+# The protocol of each benchmark, as its environments describe it.
+PROTOCOLS = {
+    "aloha": aloha.PROTOCOL.describe(),
+    "calvin": calvin.PROTOCOL.describe(),
+    "gymnasium/FetchPush-v4": gymnasium.known("FetchPush-v4").protocol.describe(),
+    "libero": LiberoProtocol.of("libero_10").to_json("libero_10"),
+    "maniskill": maniskill.PROTOCOL,
+    "metaworld": metaworld.PROTOCOL.describe(),
+    "pusht": gymnasium.known("gym_pusht/PushT-v0").protocol.describe(),
+    "simpler": simpler.PROTOCOL,
+}
+
+
+@pytest.mark.parametrize("benchmark", sorted(PROTOCOLS))
+def test_the_rate_that_the_hub_gets_is_of_the_success_that_the_protocol_counts(benchmark: str, tmp_path: Path) -> None:
+    """One of four episodes is solved at its end, two more were before."""
+    protocol = PROTOCOLS[benchmark]
+    config = EvalConfig.model_validate(
+        {
+            "policies": [{"name": "p", "url": "http://localhost:1"}],
+            "suites": [{"envs": [LINE], "episodes": 4}],
+            "out": tmp_path / "run",
+        }
+    )
+    with Store(config) as store:
+        store.begin_run(config, VERSIONS)
+        for number, job in enumerate(plan(store.cells)):
+            result = EpisodeResult(job.key, "done", number < 3, number < 1, steps=9)
+            store.record(result, 1, finished=1.8e9)
+        for cell in store.cells:
+            store.note_env(cell.place, EnvInfo({"protocol": protocol}, {}))
+        store.end_run("complete")
+    [score] = scores(Results.load(config.out))
+    counts_the_last_state = re.search("at the end|last step|last state", str(protocol.get("success"))) is not None
+    assert score.metric == protocol["metric"] == ("success_at_end" if counts_the_last_state else "success_once")
+    assert score.rate.successes == (1 if counts_the_last_state else 3)
+
+
+def test_a_protocol_without_its_metric_is_no_protocol() -> None:
+    [metric] = [field for field in fields(BenchmarkProtocol) if field.name == "metric"]
+    assert metric.default is MISSING
 
 
 @pytest.mark.parametrize(

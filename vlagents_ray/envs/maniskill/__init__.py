@@ -30,6 +30,7 @@ PROTOCOL = {
     "ignore_terminations": True,  # an episode continues to the step limit after success or failure
     "reconfiguration_freq": 1,  # the scene is rebuilt for each episode, with other objects if the task draws them
     "metrics": ["success_once", "success_at_end"],
+    "metric": "success_once",  # the first of them, which ManiSkill's baselines compare
     "seeds": "one an environment",  # each episode has its own seed, which determines all its random draws
 }
 

@@ -11,11 +11,12 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 from datetime import datetime, timezone
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import yaml
 from pydantic import BaseModel, ConfigDict, Field, field_validator
 
+from vlagents_ray.envs.base import Metric
 from vlagents_ray.errors import ConfigError
 from vlagents_ray.evaluate.artifacts.storage import whole_folder
 from vlagents_ray.evaluate.results.reader import CellResults, Results, have_common_rate, rate_of
@@ -23,8 +24,6 @@ from vlagents_ray.evaluate.results.statistics import Rate
 from vlagents_ray.evaluate.results.summary import pushed_of, stated
 from vlagents_ray.naming import distinct, plain
 
-Metric = Literal["success_once", "success_at_end"]
-_AT_END = "at the end"  # SIMPLER's protocol: the last state decides
 _MOST_NOTED = 5  # deviations in a note
 
 
@@ -39,7 +38,7 @@ class Score:
     @property
     def metric(self) -> Metric:
         """The success that the benchmark's protocol counts: after some step, or after the last."""
-        at_end = any(_protocol(one).get("success") == _AT_END for one in self.cells)
+        at_end = any(_protocol(cell).get("metric") == "success_at_end" for cell in self.cells)
         return "success_at_end" if at_end else "success_once"
 
     @property
