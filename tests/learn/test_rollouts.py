@@ -148,6 +148,23 @@ def test_the_replay_is_a_column() -> None:
     np.testing.assert_array_equal(got["replay.tokens"][:, 0], np.rint(100 * got["action"]))
 
 
+def test_groups_of_several_envs_share_no_number_and_no_two_episodes_of_an_env_share_a_policy_seed() -> None:
+    envs = [LINE, "eval_fakes:OtherLine"]
+    with Rollouts(RolloutPlan(envs, ToZero, groups=3, workers=2, seed=10)) as found:
+        got = [arrays(batch) for batch in itertools.islice(found, 24)]
+    groups: dict[int, list[str]] = {}
+    seeds: dict[str, list[int]] = {}
+    for columns in got:
+        key = str(columns["key"][0]).partition("~")[0]
+        start, _, rest = key.partition("@")
+        seed, _, policy_seed = rest.partition(":")[0].partition("/")
+        groups.setdefault(int(columns["episode"][0]), []).append(start)
+        seeds.setdefault(start.partition("#")[0], []).append(int(policy_seed or seed))
+    assert sorted(groups) == list(range(8))
+    assert all(len(starts) == 3 and len(set(starts)) == 1 for starts in groups.values())
+    assert all(len(set(of_env)) == len(of_env) == 12 for of_env in seeds.values())
+
+
 def test_a_group_begins_in_one_state_and_differs_in_the_seed_of_the_policy() -> None:
     with Rollouts(RolloutPlan(LINE, ToZero, groups=3, workers=2, seed=10)) as found:
         got = [arrays(batch) for batch in itertools.islice(found, 6)]

@@ -33,6 +33,7 @@ from vlagents_ray.registry import require
 WANTED = ("logprob", "value", "entropy", REPLAY)  # columns that a policy fills
 
 _FIRST_ROWS = 128  # allocated; unwritten memory costs nothing
+_OTHER_MEMBERS = 2**31  # added to the policy seeds of a group's further members
 
 
 class TransitionRecorder(EpisodeRecorder):
@@ -462,8 +463,9 @@ class Rollouts(AbstractContextManager["Rollouts"], Iterator[Any]):
             state, member = divmod(number, self._settings.groups)
             episode, turn = divmod(state, len(self._cells))
             cell = self._cells[turn]
-            # The first of a group is the episode of an evaluation; the others have policy seeds above its own.
-            policy_seed = self._settings.seed + number if member else None
+            # The first of a group is the episode of an evaluation. The policy seeds of the others are above all of
+            # those, so that no two episodes of an environment share their noise.
+            policy_seed = self._settings.seed + _OTHER_MEMBERS + number if member else None
             job = Job(EpisodeKey(cell.env, episode, self._settings.seed + episode, cell.fingerprint, policy_seed), cell)
             self._episodes[job.key] = _PlannedEpisode(job, number)
             self._queue.put(job)
@@ -479,6 +481,14 @@ class Rollouts(AbstractContextManager["Rollouts"], Iterator[Any]):
                 self._handle(job, report)
                 self._replay_stale()
                 self._state.notify_all()
+
+    def _with_start_state(self, transitions: Any, start_state: int) -> Any:
+        """Return transitions that are numbered by their start state among those of all environments.
+
+        A worker numbers the states of one environment; episodes of one number would be a group of several tasks.
+        """
+        column = tensors(self._pa, np.full(transitions.num_rows, start_state, np.int64))
+        return transitions.set_column(transitions.schema.get_field_index("episode"), "episode", column)
 
     def _running_pool(self) -> Workers:
         if self._pool is None:
@@ -499,6 +509,8 @@ class Rollouts(AbstractContextManager["Rollouts"], Iterator[Any]):
             self.stats.retries += 1
             self._queue.put_back(job.again())
             return
+        if transitions is not None:
+            transitions = self._with_start_state(transitions, episode.number // self._settings.groups)
         episode.over, episode.transitions = True, transitions
         if transitions is None:
             self.stats.lost += 1
