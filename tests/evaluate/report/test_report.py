@@ -186,6 +186,18 @@ def test_one_policy_that_solved_everything_has_no_failures_and_nothing_to_compar
     assert "100.0 % solved" in page.words
 
 
+@pytest.mark.parametrize(("better", "verdict"), [(4, ", not told apart"), (20, "")])
+def test_the_headline_of_two_policies_is_their_difference(better: int, verdict: str, tmp_path: Path) -> None:
+    """The rate of the better one was chosen by its size, and says nothing about the other."""
+    policies = [{"name": name, "url": f"http://localhost:{port}"} for port, name in enumerate("ab", 1)]
+    config = EvalConfig.model_validate(
+        {"policies": policies, "suites": [{"envs": [LINE], "episodes": 40}], "out": tmp_path}
+    )
+    page = page_of(record(config, lambda cell, seed: 7 if cell.contender == "b" or seed >= better else None))
+    assert f"+{100 * better / 40:.1f} points b less a{verdict} 95 % [" in page.words
+    assert "solved by the best" not in page.words
+
+
 def test_a_run_without_an_episode_has_a_page(tmp_path: Path) -> None:
     config = runs(tmp_path)
     with Store(config) as store:

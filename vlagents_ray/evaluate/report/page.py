@@ -24,7 +24,7 @@ from vlagents_ray.evaluate.plan.config import EvalConfig
 from vlagents_ray.evaluate.report import charts
 from vlagents_ray.evaluate.report.charts import BarChart, duration, interval, number, percent, quantity
 from vlagents_ray.evaluate.report.episodes import AT_ONCE, Gallery, episodes, errors, failures
-from vlagents_ray.evaluate.report.success import compare_all, learning_curves, success_table, totals
+from vlagents_ray.evaluate.report.success import Comparisons, compare_all, learning_curves, success_table, totals
 from vlagents_ray.evaluate.results.changes import Change
 from vlagents_ray.evaluate.results.comparison import clock_gaps
 from vlagents_ray.evaluate.results.reader import CellResults, Results, Run, by_timing, rate_of
@@ -77,15 +77,16 @@ def write_report(results: Results, path: Path, *, inline: bool = False, accept_c
 
 def report(summary: Summary, gallery: Gallery, *, accept_changes: bool = False) -> str:
     results, total = summary.results, summary.total
+    compared = compare_all(summary, accept_changes=accept_changes)
     figures = [
-        _solved(summary),
+        _answer(summary, compared) or _solved(summary),
         Figure(number(total.episodes, 0), "episodes", f"of {number(total.planned, 0)} planned"),
         Figure(number(total.steps, 0), "env steps", f"{number(summary.steps_per_second)} a second"),
         Figure(duration(summary.wall_seconds), "wall time", f"{quantity(total.retries, 'attempt')} repeated"),
     ]
     sections = [
         Section("Success", "success", success_table(summary)),
-        Section("Comparison", "comparison", compare_all(summary, accept_changes=accept_changes)),
+        Section("Comparison", "comparison", compared),
         Section("Gap to the synchronous score", "real_time", totals(clock_gaps(results))),
         Section("Learning curve", "learning_curve", learning_curves(summary)),
         Section("Latency", "latency", latency(summary)),
@@ -110,8 +111,31 @@ def report(summary: Summary, gallery: Gallery, *, accept_changes: bool = False) 
     )
 
 
+def _answer(summary: Summary, compared: Comparisons | None) -> Figure | None:
+    """Return the headline of a comparison of two policy ids, which is their difference; None for any other report.
+
+    The rate of the better one would be too high, as it is chosen by its rate. Differences do not allow for cells that
+    may stop early.
+    """
+    may_stop = any(group.success_once.error_rate is not None for group in summary.cells)
+    differences = [] if compared is None else [row for part in compared.parts for row in (*part.shown, *part.folded)]
+    if may_stop or len(differences) != 1:
+        return None
+    [difference] = differences
+    verdict = "" if difference.decided else ", not told apart"
+    low, high = (charts.points(bound) for bound in difference.interval)
+    return Figure(
+        f"{charts.points(difference.pairs.difference)} points",
+        f"{difference.a} less {difference.b}{verdict}",
+        f"95 % [{low}, {high}], p {charts.p_value(difference.adjusted)}",
+    )
+
+
 def _solved(summary: Summary) -> Figure:
-    """Return the headline: a rate if its cells have a common one, of synchronous episodes if there are any."""
+    """Return the headline without a comparison.
+
+    It is a rate, if the cells have a common one, of synchronous episodes if there are any.
+    """
     best = summary.best[0]
     timing, part = next(iter(summary.parts(best).items()))
     name = "solved" if len(summary.results.contenders) == 1 else f"solved by the best, {best}"
