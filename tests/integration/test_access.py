@@ -293,7 +293,10 @@ def test_a_certificate_that_is_not_to_be_trusted_is_named_with_the_cure(served: 
     for ca in (None, authority(tmp_path, "stranger").file):
         with pytest.raises(ConfigError, match="ca="), served.agent("arm", ca=ca) as agent:
             agent.reset(Obs(), "x")
-    with pytest.raises(ConfigError, match="not PEM files"), served.agent("arm", ca=served.keys) as agent:
+    with (
+        pytest.raises(ConfigError, match="expected a file with the certificate of the CA"),
+        served.agent("arm", ca=served.keys) as agent,
+    ):
         agent.reset(Obs(), "x")
 
 
@@ -342,6 +345,7 @@ WHO = [
     (REPLICA, "tcp", "local", "key"),  # and its worker's own, which wants the token
     (REPLICA, "tcp", "any", "token"),  # calls between deployments: see below
     (REPLICA, "unix", r"@vlagents-ray-[0-9a-f]{32}", "key"),
+    (r"driver", "unix", r"@vlagents-ray-port-[0-9]+", "machine"),  # claims of ports, of which others read the owner
     (REPLICA, "unix", r".*/sockets/\.?vla[0-9a-f]{8}", "user"),
 ]  # fmt: skip
 

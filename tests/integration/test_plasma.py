@@ -34,6 +34,7 @@ from vlagents_ray.client.transports.serve_handle import PlasmaTransport
 from vlagents_ray.errors import DeadlineExceeded, MalformedMessage, MessageTooLarge
 from vlagents_ray.protocol.messages import PlasmaAddress, Request
 from vlagents_ray.ray_tools.reaper import MARK
+from vlagents_ray.ray_tools.session import local_servers
 from vlagents_ray.serve.launch.deployment_file import deployment
 from vlagents_ray.serve.launch.server import Server, running_server
 
@@ -153,7 +154,9 @@ def test_a_ray_program_that_cannot_be_changed_joins_by_the_variables_of_the_docs
 ) -> None:
     [line] = re.findall(r"`(RAY_ENABLE\S+=0) (RAY_AUTH_MODE=token)`", (ROOT / "docs" / "connecting.md").read_text())
     (tmp_path / "learner.py").write_text(UNCHANGED)
-    this = {"RAY_ADDRESS": ray.get_runtime_context().gcs_address}  # others may run here, which "auto" may find first
+    [server] = [server for server in local_servers() if server.url == served.url]
+    # Others may run here, which "auto" may find first.
+    this = {"RAY_ADDRESS": server.ray_address, "RAY_AUTH_TOKEN_PATH": server.token_file}
     ran = of_the_user(tmp_path / "learner.py", served.url, **this, **dict(one.split("=") for one in line))
     assert ran.stdout == "True\n", ran.stderr
 

@@ -99,9 +99,8 @@ def test_a_program_with_another_token_joins_with_that_of_the_server(monkeypatch:
     monkeypatch.setattr(os, "environ", os.environ | {"RAY_AUTH_TOKEN": "mine"})
     monkeypatch.setattr(ray, "init", lambda *_, **__: found.update(os.environ))
     monkeypatch.setattr("vlagents_ray.ray_tools.private.reread_authentication", lambda: None)
-    server = LocalServer("http://127.0.0.1:8000", ("noop",), "127.0.0.1:1")
-    of_server = {"HOME": "/home/service", "RAY_AUTH_TOKEN_PATH": "/run/token"}
-    monkeypatch.setattr(found_here, "_found", lambda: iter([(server, of_server)]))
+    server = LocalServer("http://127.0.0.1:8000", ("noop",), "127.0.0.1:1", "/run/token")
+    monkeypatch.setattr(found_here, "_running_servers", lambda: iter([server]))
     before = use_loopback(True)
     try:
         join()

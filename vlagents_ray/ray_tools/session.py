@@ -272,6 +272,7 @@ class LocalServer:
     url: str  # http(s)://host:port
     apps: tuple[str, ...]  # names of its applications, reached at serve://APP inside the cluster
     ray_address: str  # host:port of its Ray cluster
+    token_file: str  # path of the token of that cluster, which runs any code as this user: `RAY_AUTH_TOKEN_PATH`
 
 
 def join(server: str | None = None, **options: Any) -> LocalServer:
@@ -289,7 +290,7 @@ def join(server: str | None = None, **options: Any) -> LocalServer:
         options: Further options of `ray.init`, such as `log_to_driver`.
 
     Returns:
-        The URL of the server, its applications, and the address of its Ray cluster.
+        The URL of the server, its applications, and the address and the token's file of its Ray cluster.
 
     Raises:
         ConfigError: No server of this user is ready on this machine, or several are ready and `server` is None, or this
@@ -297,7 +298,7 @@ def join(server: str | None = None, **options: Any) -> LocalServer:
     """
     import ray
 
-    chosen, environment = _chosen(server)
+    chosen = _chosen(server)
     if ray.is_initialized():
         if ray.get_runtime_context().gcs_address == chosen.ray_address:
             return chosen
@@ -307,7 +308,7 @@ def join(server: str | None = None, **options: Any) -> LocalServer:
         )
     if os.environ.get(MODE, "token").lower() != "token":
         raise ConfigError(f"{MODE}={os.environ[MODE]}: the Ray of {chosen.url} needs its token; unset {MODE}")
-    _set_variables({MODE: "token", ALONE: "0", _TOKEN: None, _TOKEN_PATH: environment[_TOKEN_PATH]})
+    _set_variables({MODE: "token", ALONE: "0", _TOKEN: None, _TOKEN_PATH: chosen.token_file})
     private.use_loopback(True)  # Ray has already read the variables, when it was imported
     private.reread_authentication()
     ray.init(chosen.ray_address, **{"log_to_driver": True, "logging_level": "WARNING"} | options)
@@ -319,14 +320,16 @@ def announce(url: str, apps: Mapping[str, str], ray_address: str) -> None:
 
     `apps` are its applications by name, and `ray_address` is host:port of its Ray cluster.
     """
-    new = Path(os.environ[MARK]) / f"{_FILE}.new"
-    new.write_text(json.dumps(asdict(LocalServer(url, tuple(apps), ray_address))))
+    folder = Path(os.environ[MARK])
+    server = LocalServer(url, tuple(apps), ray_address, str(folder / _TOKEN_FILE))
+    new = folder / f"{_FILE}.new"
+    new.write_text(json.dumps(asdict(server)))
     new.replace(new.with_name(_FILE))
 
 
 def local_servers() -> list[LocalServer]:
     """List the ready servers of this user on this machine, sorted by URL."""
-    return sorted((server for server, _ in _found()), key=lambda server: server.url)
+    return sorted(_running_servers(), key=lambda server: server.url)
 
 
 def metrics_urls() -> tuple[str, ...]:
@@ -340,17 +343,17 @@ def metrics_urls() -> tuple[str, ...]:
     )
 
 
-def _chosen(wanted: str | None) -> tuple[LocalServer, dict[str, str]]:
-    """Return the server whose URL or application is `wanted`, and the environment of its Ray's daemon."""
-    found = list(_found())
+def _chosen(wanted: str | None) -> LocalServer:
+    """Return the server whose URL or application is `wanted`."""
+    servers = local_servers()
     url = None if wanted is None else wanted.rstrip("/").replace("://localhost:", "://127.0.0.1:")
-    fitting = [one for one in found if wanted is None or url == one[0].url or wanted in one[0].apps]
+    fitting = [server for server in servers if wanted is None or url == server.url or wanted in server.apps]
     if len(fitting) == 1:
         return fitting[0]
-    there = ", ".join(sorted(f"{one.url} ({', '.join(one.apps)})" for one, _ in found))
+    there = ", ".join(f"{server.url} ({', '.join(server.apps)})" for server in servers)
     if fitting:
-        raise ConfigError(f"got {len(fitting)} servers on this machine, {there}; say which: join('{found[0][0].url}')")
-    if found:
+        raise ConfigError(f"got {len(fitting)} servers on this machine, {there}; say which: join('{servers[0].url}')")
+    if servers:
         raise ConfigError(f"got {wanted!r}, want the URL or an application of a server on this machine: {there}")
     raise ConfigError(
         "no server of this user is ready on this machine; start one with `vlagents-ray serve POLICY`. Those of other "
@@ -358,8 +361,8 @@ def _chosen(wanted: str | None) -> tuple[LocalServer, dict[str, str]]:
     )
 
 
-def _found() -> Iterator[tuple[LocalServer, dict[str, str]]]:
-    """Yield the servers of this user on this machine, each with the environment of its Ray's daemon."""
+def _running_servers() -> Iterator[LocalServer]:
+    """Yield the servers of this user on this machine, by the daemons of their Rays."""
     for process in Path("/proc").glob("[0-9]*"):
         try:
             words = (process / "cmdline").read_bytes().split(b"\0")
@@ -368,9 +371,10 @@ def _found() -> Iterator[tuple[LocalServer, dict[str, str]]]:
             pairs = (one.partition(b"=") for one in (process / "environ").read_bytes().split(b"\0"))
             environment = {os.fsdecode(key): os.fsdecode(value) for key, _, value in pairs}
             content = json.loads((Path(environment[MARK]) / _FILE).read_text())
-            address = f"--gcs-address={content['ray_address']}"
+            server = LocalServer(**{**content, "apps": tuple(content["apps"])})
+            address = f"--gcs-address={server.ray_address}"
         except (OSError, KeyError, ValueError, TypeError):  # it has ended, is another user's, or is not announced
             continue
         # A killed cluster may have left the folder, and another cluster may use it now.
         if any(address in os.fsdecode(word) for word in words):
-            yield LocalServer(content["url"], tuple(content["apps"]), content["ray_address"]), environment
+            yield server
