@@ -93,6 +93,9 @@ class DayClock:
     def monotonic(self) -> float:
         return self.now
 
+    def perf_counter(self) -> float:
+        return self.now
+
     def time(self) -> float:
         return self.now + self.offset
 
