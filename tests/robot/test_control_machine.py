@@ -64,7 +64,7 @@ class Machine(RuleBasedStateMachine):
         self.info: dict[str, Any] = {}
         self.from_afar: list[dict[str, str]] = []
         self.passed: list[bytes] = []
-        self.humans = 0  # applied actions of a run that are the human's
+        self.humans = 0  # applied actions of a run that are the human's, and not safe ones in their place
         self.wrong: list[str] = []
         self.thread: threading.Thread | None = None
         self.ready, self.go = threading.Semaphore(0), threading.Semaphore(0)
@@ -145,13 +145,16 @@ class Machine(RuleBasedStateMachine):
         """Compare an action with the model."""
         value = float(action[0])
         humans = value == HUMANS
-        self.humans += self.engaged
+        accepted = self.engaged and not self.wild  # the guard refuses a wild one, and a safe one takes its place
+        self.humans += accepted
         if self.commanded_stop or self.barked:
             self.wrong.append(f"{value} after a stop without a restart")
         if self.paused and not self.engaged:
             self.wrong.append(f"{value} in a pause")
         if not self.engaged and humans and self.last != HUMANS:
             self.wrong.append("the human's action, who has let go")
+        if accepted and not humans:
+            self.wrong.append(f"{value} in place of the human's action, which the guard accepts")
         if self.engaged and not humans and value != self.last:
             self.wrong.append(f"{value}, as the policy took the robot from the human")
         if action.tobytes() not in self.passed:
