@@ -616,8 +616,8 @@ def _undeclared(contract: Contract) -> str:
         what = "its state has no `joints` of the size of an action, or its actions are not joints"
     return (
         f"the motion cannot be checked, as {what}. Give the class a `contract`, such as "
-        f"Contract(state={{'joints': StateSpec(6, 'rad')}}, action=ActionSpec(dim=6, space='joint', delta=False)); "
-        f"see docs/arms.md"
+        f"Contract(state={{'joints': StateSpec(6, 'rad')}}, action=ActionSpec(dim=6, space='joint', delta=False)), "
+        f"or check by the contract of a policy (--policy URL), as topics of ROS state no meaning; see docs/arms.md"
     )
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import re
 import threading
 from collections import deque
 from collections.abc import Callable, Iterator
@@ -370,18 +371,24 @@ def test_a_policy_for_another_robot_is_refused(tmp_path: Path, capsys: pytest.Ca
     assert "camera 'front': the policy needs it, the env gives ['top']" in capsys.readouterr().err
 
 
+@pytest.mark.parametrize("declared", [False, True])
 def test_the_check_of_a_robot_behind_topics_moves_nothing(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, *, declared: bool
 ) -> None:
+    """Topics do not state whether their numbers are targets; the contract of a policy does."""
     monkeypatch.setattr("builtins.input", lambda _: "")  # the person cannot tell
-    with rosbridge_double() as double, RosArm(double.publish, lambda: double.on(COMMANDS)):
+    with ahead_server(Ahead()) as port, rosbridge_double() as double:
         (tmp_path / "arm.yaml").write_text(yaml.safe_dump(ros_arm.settings(double.url)))
-        assert command.main(["check", "--ros", str(tmp_path / "arm.yaml"), "--hz", "20"]) == 0
+        policy = ["--policy", f"http://127.0.0.1:{port}"] if declared else []
+        with RosArm(double.publish, lambda: double.on(COMMANDS)):
+            status = command.main(["check", "--ros", str(tmp_path / "arm.yaml"), "--hz", "20", *policy])
+        assert status == (0 if declared else 3)
         assert len({tuple(one["data"]) for one in double.on(COMMANDS)}) <= 1, "stops, with the measured pose"
     printed = capsys.readouterr().out
     assert "ok observation" in printed
     assert "not checked cameras" in printed
-    assert "not checked order" in printed
+    assert re.search("^not checked .*order", printed, re.MULTILINE)
+    assert ("NOT CHECKED" in printed) == ("--policy URL" in printed) == (not declared)
 
 
 def test_an_action_of_another_length_is_not_published() -> None:
