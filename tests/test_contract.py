@@ -78,7 +78,7 @@ def test_each_difference_is_named(env: Contract, word: str) -> None:
 def test_all_differences_are_told_at_once() -> None:
     with pytest.raises(ContractMismatch) as caught:
         require_match(POLICY, replace(ENV, gripper=False, control_hz=5, state={}))
-    assert str(caught.value).count("\n- ") == 3
+    assert str(caught.value).count("\n  - ") == 3
 
 
 def test_a_wider_env_takes_a_narrower_policy() -> None:

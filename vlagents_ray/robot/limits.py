@@ -75,6 +75,9 @@ class Limits:
             path: The file or folder.
             action: The meaning of the actions of a dataset that does not contain it; default: absolute targets.
 
+        Returns:
+            The limits of the file; those of a dataset allow somewhat more than its demonstrations.
+
         Raises:
             ConfigError: The file is missing, or has an unknown key or a wrong value.
             MissingDependency: YAML needs the extra "limits", a dataset "record".
