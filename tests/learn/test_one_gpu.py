@@ -153,6 +153,7 @@ def test_counts_with_another_layout_are_released_by_torch_itself(
 
     monkeypatch.setattr(torch.UntypedStorage, "_release_ipc_counter_cuda", release, raising=False)
     monkeypatch.setattr(shared_values, "_FIRST_COUNT", 64 + 8 * 100)
+    shared_values._warn_of_counts.cache_clear()  # an earlier test may have caused the warning, which comes once
     with shared(model("cpu").state_dict()) as handles:
         assert released == []
     assert [counter for _, counter in released][::-1] == [one.counter for one in handles.storages.values()]

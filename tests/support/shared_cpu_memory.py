@@ -6,6 +6,7 @@ in a shared file with a header of 64 bytes, in unsigned numbers, and with a limb
 
 from __future__ import annotations
 
+import itertools
 import os
 import struct
 import sys
@@ -21,13 +22,15 @@ from vlagents_ray.weights.shared_values import StorageHandle, counted_reads
 GPU = "GPU-of-the-test"
 _FOLDER = Path("/dev/shm")
 _HEADER, _SLOTS = 64, 10_000
+_FILES = itertools.count()
 
 
 class ReaderCounts:
     """Torch's counts of the readers of memory that this process has sent."""
 
     def __init__(self) -> None:
-        self.name = f"/readers_{os.getpid()}_{id(self)}"
+        # Readers keep files of counts open by their names, so that no name is ever used again, as torch's are not.
+        self.name = f"/readers_{os.getpid()}_{next(_FILES)}"
         self.next = 0
         self.limbo: list[tuple[int, Any]] = []  # slots, and their storages
         self._path = _FOLDER / self.name[1:]
