@@ -160,7 +160,7 @@ def test_what_other_replicas_call_reaches_the_part_that_has_it(monkeypatch: pyte
     assert given == args
 
 
-def test_a_replica_answers_what_waits_before_its_observers_and_its_ways_in_close() -> None:
+def test_a_replica_answers_what_waits_before_its_ways_in_and_its_observers_close() -> None:
     closed: list[str] = []
 
     def part(name: str, **more: Any) -> Any:
@@ -182,4 +182,4 @@ def test_a_replica_answers_what_waits_before_its_observers_and_its_ways_in_close
         assert await asyncio.gather(*one._tasks, return_exceptions=True)
 
     asyncio.run(close())
-    assert closed == ["sessions", "migrator", "engine", "observers", "metrics", "local", "stream"]
+    assert closed == ["sessions", "migrator", "engine", "local", "stream", "observers", "metrics"]

@@ -155,6 +155,8 @@ def test_the_policy_is_built_where_it_will_run(tmp_path: Path, monkeypatch: pyte
         "    contract = Contract(action=ActionSpec(dim=int(six.__version__.split('.')[1])))\n"
         "    def __init__(self, gain=1.0):\n"
         "        os.environ['SOURCE']\n"
+        "    def act(self, obs):\n"
+        "        raise NotImplementedError\n"
     )
     environment = args(python=str(python), env_vars={"SOURCE": "/src"})
     contract = check_policy(environment, "only_there:Policy", {"gain": 2.0})
