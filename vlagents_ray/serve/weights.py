@@ -632,6 +632,11 @@ class WeightUpdates:
         if forget is not None:
             self._given.pop(forget, None)
 
+    def acting(self) -> tuple[int, str]:
+        """Return number and fingerprint of the version with which all sessions act."""
+        newest = self.own().newest
+        return newest.number, newest.fingerprint
+
     def describe(self) -> dict[str, dict[str, Any]] | None:
         """Return number and fingerprint of the newest and the pinned version, for the metadata; None while it loads."""
         try:

@@ -104,6 +104,7 @@ class Moves(RuleBasedStateMachine):
         assert reply.act.action[2] == np.float32(drawn), "an act was lost or came twice"
         version = reply.act.info["policy"]["version"]
         assert version == session.version
+        assert reply.act.action[0] == version, "it acts with other weights than it states"
         session.acts, session.step = session.acts + 1, reply.step
 
     @rule(name=st.sampled_from(_NAMES))
@@ -203,6 +204,23 @@ def test_sessions_survive_any_order_of_moves_pushes_and_rests(served: Replicas) 
             print_blob=True,
         ),
     )
+
+
+def test_a_session_that_moves_acts_with_the_weights_that_were_pushed_before(served: Replicas) -> None:
+    """The child process of its first replica last acted for it with older weights, which the other child may hold."""
+    number = served.engines[0].weights.number + 1
+    follows = {"weights": "follow"}
+    assert ask(served, 0, "reset", "moving", kwargs=follows).error is None
+    options = PushOptions(mode="keep")
+    for engine in served.engines:
+        engine.weights.stage(number, gains(float(number)), options)
+        engine.weights.commit(number, options)
+    assert ask(served, 1, "reset", "beside", kwargs=follows).error is None  # the weights are in use at that replica
+    reply = ask(served, 1, "act", "moving")
+    for name in ("moving", "beside"):
+        assert ask(served, 1, "close", name).error is None
+    assert reply.error is None
+    assert reply.act.info["policy"]["version"] == reply.act.action[0] == number
 
 
 def test_no_key_has_more_sessions_at_a_replica_than_it_may_whatever_moves_there() -> None:

@@ -550,7 +550,8 @@ class Engine:
             return {"released": self.sessions.release(session_id, request.kwargs["version"])}
         if request.op == "adopt":
             self.sessions.free(session_id)  # the replica of this process reuses names, for sessions that it compares
-            self.adopt(session_id, request.kwargs)
+            # That replica decides which version of the weights acts: the session's may be older, or not held here.
+            self.adopt(session_id, {**request.kwargs, "parameters": self.weights.acting()})
         elif request.op == "observe":
             self._observe(pending)
         elif request.op == "weights":
