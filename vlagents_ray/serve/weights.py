@@ -423,7 +423,14 @@ class ModelWeights:
     def _held(self, version: WeightsVersion) -> Mapping[str, Any]:
         """Return references to values with the types, shapes and devices of the version's, without waiting for acts."""
         values = version.values
-        return self._live_values if values is None or version.on_host else values
+        return self._parameters() if values is None or version.on_host else values
+
+    def _parameters(self) -> Mapping[str, Any]:
+        """Return the agent's own values. Lazy layers have none before the first act, which has their sizes."""
+        if not self._live_values:
+            with self._busy:
+                self._live_values = self._agent.parameters()
+        return self._live_values
 
     def _read(self, version: WeightsVersion, read: Callable[[Mapping[str, Any]], T]) -> T:
         """Return the result of a function of a version's values, which may be the agent's.
@@ -436,6 +443,8 @@ class ModelWeights:
             values = version.values
             return read(self._live_values if values is None else values)
 
+        if version.values is None:
+            self._parameters()
         if not self._in_place:
             return result()
         switches = self._switches

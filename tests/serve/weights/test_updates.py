@@ -62,6 +62,37 @@ AGENTS = pytest.mark.parametrize(
 )
 
 
+class Lazy(Doubled):
+    """Has no parameters before its first act, as torch's lazy layers take their sizes from it."""
+
+    def initialize(self) -> None:
+        super().initialize()
+        self.size = np.zeros(1, np.int64)  # that of the layer, once it is known
+
+    def shared_objects(self) -> list[Any]:
+        return [*super().shared_objects(), self.size]
+
+    def parameters(self) -> dict[str, Any]:
+        return super().parameters() if self.size[0] else {}
+
+    def act(self, obs: Obs) -> Act:
+        self.size[0] = 2
+        return super().act(obs)
+
+
+@pytest.mark.parametrize("partial", [False, True])
+def test_parameters_that_the_first_act_makes_can_be_pushed(serving: Callable[..., Engine], partial: bool) -> None:
+    served = Served(serving(Lazy()))
+    options = PushOptions("keep", partial, allow_same=True)
+    served.reset("a")
+    with pytest.raises(InvalidWeights, match="unknown, want one of the policy's 0 names"):
+        served.learn.stage(1, gains(1), options)
+    served.act("a")
+    served.learn.stage(2, gains(2), options)
+    served.learn.commit(2, options)
+    assert served.act("a") == (2, 2)
+
+
 @AGENTS
 def test_an_episode_ends_with_the_weights_that_it_began_with_unless_they_are_pushed_to_it(
     serving: Callable[..., Engine], agent: type[Gain]
