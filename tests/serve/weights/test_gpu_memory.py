@@ -180,9 +180,9 @@ def test_no_push_waits_for_an_act(cuda: FakeCuda, kind: type[OnGpu], values: str
             staged = executor.submit(
                 lambda: pushed.weights.stage(3, {name: np.full(SIZE, 3, np.float32) for name in names}, options)
             )
-            done, _ = wait([staged], 10)
+            done, _ = wait([staged], 60)
             values_of_the_newest = executor.submit(lambda: pushed.weights.portable_values(pushed.weights.newest))
-            read, _ = wait([values_of_the_newest], 10)
+            read, _ = wait([values_of_the_newest], 60)
         assert done
         assert read
     assert {float(value[0]) for value in values_of_the_newest.result().values()} == {2.0}
