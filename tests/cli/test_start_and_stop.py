@@ -41,7 +41,6 @@ def test_two_replicas_start_and_stop_in_silence(to_the_group: bool, tmp_path: Pa
     printed = log.read_text()
     assert server.returncode == 0, printed
     expected = r"serving|  policy|  API|  live page|metrics|in a Ray program|log of Ray|Ctrl-C stops"
-    expected += r"|WARNING .* Failed to get queue length"  # which is true where the machine is busy
     assert [line for line in printed.splitlines() if not re.match(expected, line)] == []
 
 
