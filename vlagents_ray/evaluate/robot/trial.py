@@ -5,7 +5,9 @@ from __future__ import annotations
 import contextlib
 import hashlib
 import hmac
-from collections.abc import Iterable, Iterator
+import itertools
+from collections import Counter
+from collections.abc import Collection, Iterable, Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -60,10 +62,12 @@ class Trial:
 def schedule(cells: Iterable[EvalCase], key: bytes) -> list[Trial]:
     """Draw the order of all trials: task by task, scene by scene, and in each scene every policy once.
 
-    With k policies, each k scenes in a row (of one seed) have the rows of a k x k Latin square in a drawn order, whose
-    columns are the policies in a drawn order. So each policy is first, second, and so on equally often, and the counts
-    differ by at most one with an incomplete rest. The draw depends on the key, the names of policies, suites and
-    environments, and the seeds, by HMAC-SHA256.
+    With k policies, each k scenes of a task in a row have the rows of a k x k Latin square in a drawn order, whose
+    columns are the policies in a drawn order. The fewer than k scenes that remain of each task share one such square:
+    they have those of its rows that the remaining scenes of the tasks before had least often, drawn among equals. So
+    each policy is first, second, and so on equally often, and the counts differ by at most one in each task, and in the
+    whole plan. Seeds begin no new square. The draw depends on the key and the names of policies, suites and
+    environments, by HMAC-SHA256.
 
     Args:
         cells: The cells of the plan, all on a robot.
@@ -76,19 +80,38 @@ def schedule(cells: Iterable[EvalCase], key: bytes) -> list[Trial]:
     for cell in cells:
         tasks.setdefault((cell.suite.name, cell.env), {})[cell.contender] = cell
     trials: list[Trial] = []
+    rows_used: Counter[int] = Counter()
     for task, contenders in tasks.items():
         suite = next(iter(contenders.values())).suite
-        for place, seed in enumerate(suite.seeds):
-            for i in range(suite.episodes):
-                block, row = divmod(i, len(contenders))
-                columns = _drawn(key, [*task, seed, block, "policy"], contenders)
-                shifts = _drawn(key, [*task, seed, block, "row"], map(str, range(len(contenders))))
-                shift = int(shifts[row])
-                for name in columns[shift:] + columns[:shift]:
-                    cell = contenders[name]
-                    job = Job(EpisodeKey(cell.env, i, seed + i, cell.fingerprint), cell)
-                    trials.append(Trial(len(trials) + 1, place * suite.episodes + i + 1, job))
+        scenes = list(itertools.product(suite.seeds, range(suite.episodes)))
+        orders = _orders(key, task, contenders, len(scenes), rows_used)
+        for number, ((seed, episode), order) in enumerate(zip(scenes, orders, strict=True), start=1):
+            for name in order:
+                cell = contenders[name]
+                job = Job(EpisodeKey(cell.env, episode, seed + episode, cell.fingerprint), cell)
+                trials.append(Trial(len(trials) + 1, number, job))
     return trials
+
+
+def _orders(
+    key: bytes, task: tuple[str, str], names: Collection[str], scenes: int, rows_used: Counter[int]
+) -> Iterator[list[str]]:
+    """Yield the order of the policies in each scene of a task.
+
+    Args:
+        rows_used: How often the last scenes of the tasks before had each row of their common square; it is updated.
+    """
+    size = len(names)
+    for first in range(0, scenes, size):
+        remaining = scenes - first
+        square = [*task, first // size]
+        columns = _drawn(key, [*square, "policy"] if remaining >= size else ["policy"], names)
+        rows = [int(row) for row in _drawn(key, [*square, "row"], map(str, range(size)))]
+        if remaining < size:
+            rows = sorted(rows, key=rows_used.__getitem__)[:remaining]
+            rows_used.update(rows)
+        for row in rows:
+            yield columns[row:] + columns[:row]
 
 
 def _drawn(key: bytes, what: list[str | int], names: Iterable[str]) -> list[str]:
