@@ -12,7 +12,7 @@ from vlagents_ray.evaluate.results.changes import Change
 from vlagents_ray.evaluate.results.comparison import Comparison, Line, comparable, comparisons
 from vlagents_ray.evaluate.results.reader import CellResults, Results, by_timing, rate_of
 from vlagents_ray.evaluate.results.statistics import ERROR_RATE, Pairs, Rate
-from vlagents_ray.evaluate.results.summary import TOTAL, Group, Summary, group_of
+from vlagents_ray.evaluate.results.summary import TOTAL, Group, Summary, group_of, summarize
 
 MOST_PAIRS = 15  # shown unfolded: those of six policy ids
 MOST_COMPARED = 780  # pairs, those of 40 policy ids; of more, such as a whole training's, only the main ones
@@ -199,10 +199,11 @@ def families(summary: Summary, *, accept_changes: bool = False) -> list[Family]:
     found = []
     for timing, cells in by_timing(summary.results.cells).items():
         results = summary.results.among(cells)
+        of_timing = summarize(results)
         every = list(itertools.combinations(results.contenders, 2))
-        wanted = every if len(every) <= MOST_COMPARED else _asked_first(summary, every)
+        wanted = every if len(every) <= MOST_COMPARED else _asked_first(of_timing, every)
         pairs, reasons = comparable(results, wanted, accept_changes=accept_changes)
-        asked = _asked_first(summary, pairs)
+        asked = _asked_first(of_timing, pairs)
         ordered = [*asked, *(pair for pair in _later_first(results, pairs) if pair not in asked)]
         # Whether a pair is the main one depends on the rates, so the adjustment is for all that could have been.
         chosen_of = None if len(wanted) == len(every) else len(every)

@@ -14,7 +14,7 @@ import numpy as np
 from vlagents_ray.evaluate.artifacts.storage import whole
 from vlagents_ray.evaluate.episode.records import EpisodeResult
 from vlagents_ray.evaluate.results.comparison import gap_to_synchronous
-from vlagents_ray.evaluate.results.reader import CellResults, Results, by_timing, rate_of
+from vlagents_ray.evaluate.results.reader import CellResults, Results, by_timing, have_common_rate, rate_of
 from vlagents_ray.evaluate.results.statistics import Rate
 
 FILE = "summary.json"
@@ -40,7 +40,7 @@ class Group:
     infra_failures: int  # episodes that failed by infrastructure; in no rate
     retries: int  # attempts that failed by infrastructure and were repeated
     steps: int  # actions executed in all episodes
-    mean_steps: float | None
+    mean_steps: float | None  # None if the episodes have no common rate, as `mean_return`
     mean_return: float | None  # of the sums of rewards
     env_step_ms: float | None  # median of the episodes' medians
     policy_ms: float | None  # median of the episodes' medians
@@ -105,12 +105,16 @@ class Summary:
 
     @property
     def best(self) -> list[str]:
-        """The policy ids, the best first, by the mean success rate of their cells."""
-        rates = {
-            name: [group.success_once.rate or 0.0 for group in self.cells if group.contender == name]
-            for name in self.results.contenders
-        }
-        return sorted(rates, key=lambda name: -sum(rates[name]) / len(rates[name]))
+        """The policy ids, the best first, by the mean success rate of their cells with one clock.
+
+        The clock is the first of `by_timing`: that of the episodes that waited for the policy, if there are any.
+        """
+        rates: dict[str, list[float]] = {name: [] for name in self.results.contenders}
+        timings = list(by_timing(self.results.cells).values())
+        for cell in timings[0] if timings else []:
+            rates[cell.contender].append(rate_of([cell], "success_once").rate or 0.0)
+        means = {name: sum(values) / len(values) if values else 0.0 for name, values in rates.items()}
+        return sorted(means, key=lambda name: -means[name])
 
     @property
     def transports(self) -> list[str]:
@@ -241,6 +245,7 @@ def write_summary(summary: Summary) -> Path:
 def group_of(name: tuple[str, str, str], cells: Sequence[CellResults]) -> Group:
     """Aggregate these cells under the name (policy id, suite, env)."""
     finished: list[EpisodeResult] = [result for cell in cells for result in cell.counted]
+    has_means = bool(finished) and have_common_rate(cells)
     return Group(
         *name,
         planned=sum(cell.planned for cell in cells),
@@ -253,8 +258,8 @@ def group_of(name: tuple[str, str, str], cells: Sequence[CellResults]) -> Group:
         ),
         retries=sum(attempt.retried for cell in cells for attempt in cell.attempts),
         steps=sum(one.steps for one in finished),
-        mean_steps=float(np.mean([one.steps for one in finished])) if finished else None,
-        mean_return=float(np.mean([one.episode_return for one in finished])) if finished else None,
+        mean_steps=float(np.mean([one.steps for one in finished])) if has_means else None,
+        mean_return=float(np.mean([one.episode_return for one in finished])) if has_means else None,
         env_step_ms=median([one.env_step_ms for one in finished]),
         policy_ms=median([one.policy_ms for one in finished]),
         policy_p95_ms=median([one.policy_p95_ms for one in finished]),
