@@ -8,11 +8,13 @@ from urllib.parse import unquote
 import pytest
 import yaml
 from eval_fakes import LINE
+from hypothesis import given
+from hypothesis import strategies as st
 from recorded_results import HOSTILE, better_later, record, runs
 
 from vlagents_ray.evaluate import EvalConfig, Results
 from vlagents_ray.evaluate.report import success
-from vlagents_ray.evaluate.report.charts import MINUS
+from vlagents_ray.evaluate.report.charts import MINUS, difference_glyph, difference_labels, difference_limit
 from vlagents_ray.evaluate.report.episodes import Gallery
 from vlagents_ray.evaluate.report.page import write_report
 from vlagents_ray.evaluate.results.store import Store
@@ -306,3 +308,33 @@ def test_real_time_and_synchronous_scores_are_compared_apart_and_their_gap_is_sh
     row = f"learner, live in real time learner, waiting 0.0 {MINUS}50.0 to +50.0 1.00 1.00 4 4 0 0 0 "
     assert row in page.words
     assert len(page.all("h3")) >= 2
+
+
+@given(st.lists(st.tuples(st.floats(-1, 1), st.floats(-1, 1)), min_size=1, max_size=8))
+def test_differences_share_an_axis_that_holds_them_all(bounds: list[tuple[float, float]]) -> None:
+    intervals = [(min(pair), max(pair)) for pair in bounds]
+    limit = difference_limit(intervals)
+    assert all(-limit <= low <= high <= limit for low, high in intervals)
+    left, middle, right = (float(label.replace(MINUS, "-")) for label in difference_labels(limit))
+    assert (left, middle, right) == pytest.approx((-100 * limit, 0, 100 * limit))
+    ends = [difference_glyph(value, (value, value), limit, decided=True).dot for value in (-limit, 0.0, limit)]
+    axis = difference_glyph(0.0, (0.0, 0.0), limit, decided=True).axis
+    assert axis == f"M{ends[0]:g} 8H{ends[2]:g}M{ends[1]:.1f} 2V14", "from the left label to the right one, with 0"
+
+
+def test_a_small_difference_is_seen_beside_its_dot() -> None:
+    """An interval of +4 to +15 points, on its axis, reaches beyond the dot of its estimate."""
+    interval = (0.04, 0.15)
+    glyph = difference_glyph(0.095, interval, difference_limit([interval]), decided=True)
+    assert glyph.range is not None
+    assert glyph.dot is not None
+    left, right = (float(number) for number in re.findall(r"[MH]([\d.]+)", glyph.range))
+    assert left < glyph.dot - 5
+    assert right > glyph.dot + 5
+
+
+@pytest.mark.parametrize("heading", ["Success", "Comparison"])
+def test_columns_of_dots_have_an_axis_in_their_head(page: Read, heading: str) -> None:
+    head = page.section(heading).split("learner@", 1)[0]
+    labels = r"\b0 50 100\b" if heading == "Success" else rf"{MINUS}(\d+) 0 \+\1\b"
+    assert re.search(labels, head), head

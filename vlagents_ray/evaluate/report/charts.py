@@ -18,6 +18,7 @@ NONE, MINUS = "\u2013", "\u2212"
 _COLOURS = 6
 _DASHES = (None, "7 3", "2 3", "9 3 2 3", "12 4", "4 4")
 _GLYPH, _EDGE = 96, 6  # width of a glyph, and margin of a dot beyond the ends of its axis
+_LIMITS = (0.05, 0.1, 0.2, 0.4, 0.6, 1.0)  # of the axes of differences
 
 
 def percent(rate: Rate) -> str:
@@ -213,12 +214,23 @@ def interval_glyph(rate: Rate) -> Glyph:
     return Glyph(axis, f"M{low:.1f} 8H{high:.1f}", dot)
 
 
-def difference_glyph(difference: float, low: float, high: float, *, decided: bool) -> Glyph:
-    """Return a difference of rates and its interval on an axis from -100 to 100 percentage points."""
+def difference_limit(intervals: Iterable[tuple[float, float]]) -> float:
+    """Return the largest difference on the common axis of these intervals, which is symmetric around 0."""
+    largest = max((abs(bound) for interval in intervals for bound in interval), default=1.0)
+    return next(limit for limit in _LIMITS if limit >= largest)
+
+
+def difference_glyph(difference: float, interval: tuple[float, float], limit: float, *, decided: bool) -> Glyph:
+    """Return a difference of rates and its interval on an axis from -`limit` to `limit`, with a mark at 0."""
     middle = _GLYPH / 2
-    left, dot, right = (middle + (middle - _EDGE) * value for value in (low, difference, high))
+    left, dot, right = (middle + (middle - _EDGE) * value / limit for value in (interval[0], difference, interval[1]))
     axis = f"M{_EDGE} 8H{_GLYPH - _EDGE}M{middle:.1f} 2V14"
     return Glyph(axis, f"M{left:.1f} 8H{right:.1f}", dot, decided)
+
+
+def difference_labels(limit: float) -> tuple[str, str, str]:
+    """Return the labels of that axis at its left end, its middle and its right end, in percentage points."""
+    return f"{MINUS}{100 * limit:g}", "0", f"+{100 * limit:g}"
 
 
 def ticks(low: float, high: float, most: int = 6) -> list[float]:

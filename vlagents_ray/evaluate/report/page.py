@@ -157,6 +157,7 @@ def _templates() -> Environment:
     env = Environment(loader=loader, autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True)
     formats = (
         "bounds",
+        "difference_limit",
         "duration",
         "interval",
         "interval_name",
@@ -169,6 +170,7 @@ def _templates() -> Environment:
     )
     env.filters.update({name: getattr(charts, name) for name in formats})
     env.filters.update(interval_glyph=charts.interval_glyph, px=charts.px, json=partial(json.dumps, ensure_ascii=False))
+    env.globals.update(difference_glyph=charts.difference_glyph, difference_labels=charts.difference_labels)
     env.globals.update(PLOT=charts.PLOT, AT_ONCE=AT_ONCE, NONE=charts.NONE, MINUS=charts.MINUS)
     for kind in ("css", "js"):  # our own files, not templates: nothing in them is escaped
         env.globals[kind] = Markup((files(__package__ or "") / f"report.{kind}").read_text("utf-8").strip())  # noqa: S704

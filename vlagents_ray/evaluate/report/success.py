@@ -7,7 +7,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from vlagents_ray.evaluate.report.charts import Glyph, RateChart, Series, difference_glyph, rate_chart
+from vlagents_ray.evaluate.report.charts import RateChart, Series, rate_chart
 from vlagents_ray.evaluate.results.changes import Change
 from vlagents_ray.evaluate.results.comparison import Comparison, Line, comparable, comparisons
 from vlagents_ray.evaluate.results.reader import CellResults, Results, by_timing, rate_of
@@ -159,7 +159,6 @@ class Difference:
     interval: tuple[float, float]  # 95 %
     adjusted: float  # p-value
     decided: bool
-    glyph: Glyph
 
 
 @dataclass(frozen=True, slots=True)
@@ -245,9 +244,8 @@ def totals(found: Sequence[Comparison]) -> list[Difference]:
 
 
 def _difference(one: Comparison, line: Line) -> Difference:
-    decided, (low, high) = line.adjusted < ERROR_RATE, line.interval
-    glyph = difference_glyph(line.pairs.difference or 0.0, low, high, decided=decided)
-    return Difference(one.a, one.b, line.suite, line.pairs, (low, high), line.adjusted, decided, glyph)
+    decided = line.adjusted < ERROR_RATE
+    return Difference(one.a, one.b, line.suite, line.pairs, line.interval, line.adjusted, decided)
 
 
 def _asked_first(summary: Summary, pairs: Sequence[tuple[str, str]]) -> list[tuple[str, str]]:

@@ -104,7 +104,7 @@ def _orders(
     size = len(names)
     for first in range(0, scenes, size):
         remaining = scenes - first
-        square = [*task, first // size]
+        square: list[str | int] = [*task, first // size]
         columns = _drawn(key, [*square, "policy"] if remaining >= size else ["policy"], names)
         rows = [int(row) for row in _drawn(key, [*square, "row"], map(str, range(size)))]
         if remaining < size:
