@@ -12,7 +12,7 @@ from in_process_evaluation import flat_config
 
 from vlagents_ray.contract import ActionSpec, Contract, StateSpec
 from vlagents_ray.envs.base import EvalEnv
-from vlagents_ray.errors import InvalidAction
+from vlagents_ray.errors import EnvFailed, InvalidAction
 from vlagents_ray.evaluate import EvalConfig, evaluate
 from vlagents_ray.evaluate.report.page import write_report
 from vlagents_ray.evaluate.results.summary import Summary
@@ -21,7 +21,21 @@ from vlagents_ray.interface import Act, Agent, Obs
 Config = Callable[..., EvalConfig]
 EPISODES = 8
 NAME = f"{__name__}:Fragile"
-TROUBLES = ["refuses", "diverges", "reward", "raises", "answers badly", "wrong state"]
+
+
+class PhysicsError(RuntimeError):
+    """As dm_control's."""
+
+
+EXPLOSIONS: dict[str, Exception] = {  # by which simulators tell that they diverged
+    "MuJoCo": RuntimeError("Nan, Inf or huge value in QACC at DOF 0. The simulation is unstable. Time = 0.0020."),
+    "dm_control": PhysicsError("Physics state is invalid. Warning(s) raised: mjWARN_BADQACC"),
+    "numpy": FloatingPointError("overflow encountered in multiply"),
+    "linear algebra": np.linalg.LinAlgError("Eigenvalues did not converge"),
+    "SciPy": ValueError("array must not contain infs or NaNs"),
+    "adapter": EnvFailed("env step: the state of 'arm' is not finite"),
+}
+TROUBLES = ["refuses", "diverges", "reward", "raises", "answers badly", "wrong state", *EXPLOSIONS]
 _OTHERS = itertools.count(10)
 _LIMIT = 1.0  # of an action; beyond it, the environment has its trouble
 
@@ -46,7 +60,9 @@ class Fragile(EvalEnv):
         number = float(self._seed)
         if abs(act.action[0]) > _LIMIT:
             if self._trouble == "refuses":
-                raise InvalidAction(f"action: got {act.action[0]}, want at most {_LIMIT}")
+                raise InvalidAction(f"action: got {act.action[0]}, want a finite number of at most {_LIMIT}")
+            if self._trouble in EXPLOSIONS:
+                raise EXPLOSIONS[self._trouble]
             if self._trouble == "raises":
                 raise RuntimeError("the simulator exploded")
             if self._trouble == "answers badly":
@@ -117,7 +133,7 @@ def test_an_episode_that_fails_leaves_those_beside_it_as_they_are(run: Callable[
     assert outcomes(run(trouble, num_envs=3)) == alone
 
 
-@pytest.mark.parametrize("trouble", ["diverges", "reward"])
+@pytest.mark.parametrize("trouble", ["diverges", "reward", *EXPLOSIONS])
 @pytest.mark.parametrize("num_envs", [1, 4])
 def test_a_simulation_that_diverges_again_under_the_same_actions_is_a_failure_of_the_policy(
     run: Callable[..., Summary], trouble: str, num_envs: int

@@ -19,7 +19,7 @@ import numpy as np
 from vlagents_ray.client.agent import RemoteAgent
 from vlagents_ray.contract import Contract
 from vlagents_ray.envs.base import ERROR, BatchEnv, Environment
-from vlagents_ray.errors import CheckpointFailed, ConfigError, InvalidAction, PolicyFailed, VLAgentsError
+from vlagents_ray.errors import CheckpointFailed, ConfigError, EnvFailed, InvalidAction, PolicyFailed, VLAgentsError
 from vlagents_ray.evaluate.episode import failures
 from vlagents_ray.evaluate.episode.latency import ChunkExecutor, Tick
 from vlagents_ray.evaluate.episode.records import Ending, EpisodeObserver, EpisodeResult, version_of
@@ -120,7 +120,10 @@ Phase = Literal["idle", "connect", "make", "env reset", "policy reset", "policy 
 
 @dataclass(frozen=True, slots=True)
 class Diverged:
-    """The outcome of an episode whose simulation diverged: its state or its reward is not a finite number."""
+    """The outcome of an episode whose simulation diverged.
+
+    Its state or its reward is not a finite number, or the simulator raised an exception that says so.
+    """
 
     error: VLAgentsError
     result: EpisodeResult  # if the policy is the cause, as the simulation diverges again under the same actions
@@ -382,8 +385,13 @@ def _step(env: BatchEnv, episodes: Sequence[_Episode], playing: Sequence[_Episod
         with _STEPPING:
             seen, rewards, terminated, truncated, infos = env.step(acts)
             answers = list(zip(episodes, seen, rewards, terminated, truncated, infos, strict=True))
-    except InvalidAction as error:
+    except (EnvFailed, InvalidAction) as error:
         if len(playing) > 1:  # of environments that one simulator runs: the error does not name the episode
+            raise
+        if failures.raised_by_divergence(error):
+            playing[0].diverged(error)
+            return
+        if isinstance(error, EnvFailed):
             raise
         playing[0].failed(error)
         return
@@ -397,7 +405,8 @@ def _step(env: BatchEnv, episodes: Sequence[_Episode], playing: Sequence[_Episod
                         raise raised
                 step = failures.checked_step(obs, reward, terminated, truncated, info, contract, images=env.looked_at)
             except VLAgentsError as error:
-                if raised is None and not failures.is_finite(obs, reward):
+                finite = raised is not None or failures.is_finite(obs, reward)
+                if not finite or failures.raised_by_divergence(error):
                     episode.diverged(error)
                 else:
                     episode.failed(error)

@@ -6,6 +6,7 @@ Without these checks a wrong output would surface later, in the encoder or in th
 from __future__ import annotations
 
 import math
+import re
 import sys
 import traceback
 from bdb import BdbQuit
@@ -131,6 +132,22 @@ def is_finite(obs: object, reward: object) -> bool:
         values += [*obs.state.values(), 0 if obs.gripper is None else obs.gripper]
     arrays = [np.asarray(value) for value in values]
     return all(np.isfinite(array).all() for array in arrays if array.dtype.kind == "f")
+
+
+# Words of simulators that raise an exception instead of returning a NaN: MuJoCo's "Nan, Inf or huge value in QACC.
+# The simulation is unstable", dm_control's "Physics state is invalid", SciPy's "array must not contain infs or NaNs".
+_DIVERGENCE = re.compile(
+    r"\b(nans?|infs?|(non-?|not )finite|diverge[ds]?|divergence|unstable|physics state is invalid)\b",
+    re.IGNORECASE,
+)
+
+
+def raised_by_divergence(error: errors.VLAgentsError) -> bool:
+    """Return whether a simulator raised `error` because its simulation diverged, by its type or its words."""
+    if not isinstance(error, errors.EnvFailed):
+        return False
+    of_numbers = isinstance(error.__cause__, FloatingPointError | OverflowError | np.linalg.LinAlgError)
+    return of_numbers or _DIVERGENCE.search(str(error)) is not None
 
 
 def checked_instruction(instruction: object, where: str) -> str:
