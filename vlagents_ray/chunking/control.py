@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import contextlib
 import copy
 import threading
+from collections.abc import Iterator
 from typing import Any, Literal, Protocol, get_args
 
 import numpy as np
@@ -15,6 +17,10 @@ from vlagents_ray.interface import Obs
 ControlState = Literal["autonomous", "paused", "human", "stopped"]
 Outcome = Literal["success", "failure"]
 PAUSED = "paused by an operator"
+COMMAND_S = 0.02
+"""The longest time, s, for which a stop waits for the end of a command: a tick at 50 Hz. A command takes less than a
+millisecond, and a stop must not wait for one that hangs.
+"""
 
 
 class Leader(Protocol):
@@ -65,6 +71,8 @@ class Control:
         self.running = False
         """Whether `run_loop` drives the robot, which commands nothing while it is paused or stopped."""
         self._lock = threading.RLock()  # a signal handler may interrupt its owner
+        self._commanding = threading.RLock()  # held during a command, and acquired before `_lock`
+        self._stopping = 0  # calls of the robot's `stop` in progress
         self._state: ControlState = "autonomous"
         self._stop: str | None = None  # the reason of a commanded stop
         self._barked = False  # whether a silence stopped the robot
@@ -112,7 +120,7 @@ class Control:
             self._pause = None
 
     def stop(self, reason: str, *, silent: str | None = None) -> None:
-        """Stop the robot until `restart`.
+        """Stop the robot until `restart`: the control loop begins no further command, and calls the robot's `stop`.
 
         Args:
             reason: The reason, for `stops`.
@@ -126,6 +134,30 @@ class Control:
             else:
                 self._barked = True
                 self._silent.add(silent)
+
+    @contextlib.contextmanager
+    def stopping(self) -> Iterator[None]:
+        """Call the robot's `stop` within this context, on any thread, after `stop` of this object.
+
+        It begins when a command in progress has ended, or after `COMMAND_S` if that hangs. The loop begins no command
+        within the context, also not after `restart`, and afterwards holds the robot for at least one tick.
+        """
+        with self._lock:
+            self._stopping += 1
+        try:
+            if self._commanding.acquire(timeout=COMMAND_S):
+                self._commanding.release()
+            yield
+        finally:
+            with self._lock:
+                self._stopping -= 1
+                self._unseen = True
+
+    @contextlib.contextmanager
+    def command(self) -> Iterator[Held | None]:
+        """Yield why the robot must not be commanded; None if one command may be sent within this context."""
+        with self._commanding:
+            yield self.held
 
     def heard(self, source: str) -> None:
         """Record that a source is no longer silent. The robot stays stopped."""
@@ -195,7 +227,7 @@ class Control:
     def held(self) -> Held | None:
         """The reason why the robot must not move, from the last `update` and later events; None if it may move."""
         with self._lock:
-            if self._state == "stopped" or self.stopped or self._unseen:
+            if self._state == "stopped" or self.stopped or self._unseen or self._stopping:
                 silent = " and the ".join(sorted(self._silent))
                 silence = f"no signal from the {silent}" if silent else "waiting for a restart (Watchdog.restart)"
                 return Held("stopped", f"stopped: {self._stop or silence}")

@@ -418,10 +418,13 @@ class _Run:
                     ago_s: Any = act.info.get(SILENT)
                     known = isinstance(ago_s, int | float) and 0 <= ago_s < math.inf
                     self.watchdog.heard("server", float(ago_s) if known else 0.0)
+                action = None
+                if stop is None:
+                    action, stop = self._applied(obs, act)
                 if stop is not None:
                     self._stop(stop)
                     self.view.add(obs, act, None, tick, pacer.since_tick_s(), stop.reason)
-                elif (action := self._applied(obs, act)) is not None:
+                elif action is not None:
                     work_s.append(pacer.since_tick_s())
                     led = INTERVENTION in act.info and SAFE not in act.info
                     self.report.interventions += led
@@ -453,7 +456,8 @@ class _Run:
                     self.watchdog.heard("loop")
                     self.watchdog.heard("server")  # not needed for this motion
                 last = self.guard(command, last)
-                self.robot.apply(last)
+                if self._command(last) is not None:
+                    break
         except InvalidAction as error:
             logger.warning("the way to the rest pose ends here: %s", error)
 
@@ -474,23 +478,38 @@ class _Run:
         self.agent.interrupt()
         self.report.count(why)
 
-    def _applied(self, obs: Obs, act: Act) -> np.ndarray | None:
-        """Apply the action, and return it; a robot at rest gets no safe action."""
+    def _applied(self, obs: Obs, act: Act) -> tuple[np.ndarray | None, Held | None]:
+        """Apply the action, and return it, or why the robot was stopped meanwhile.
+
+        A robot at rest gets no safe action: then both are None.
+        """
         safe, action = _safe(act), act.action
-        if safe is not None:
+        if safe is not None and self.standing:
             self.report.count(safe)
-            if self.standing:
-                return None
+            return None, None
         if self.fit is not None and safe is None and not act.info.get(INTERVENTION):
             self.fit.require(None, act.info.get(PLANNED, action[np.newaxis]))
             self.fit = None
         if self.agent.check is not self.guard:  # else it was checked before `act` returned
             action = self.guard(action, self.guard.reference(obs, self.last) if self.standing else self.last)
-        self.standing, self.last = False, action
-        began_s = time.perf_counter()
-        self.robot.apply(action)
-        self.apply_s.append(time.perf_counter() - began_s)
-        return action
+        if (stop := self._command(action)) is not None:
+            return None, stop
+        if safe is not None:
+            self.report.count(safe)
+        return action, None
+
+    def _command(self, action: np.ndarray) -> Held | None:
+        """Apply an action, unless the robot has been stopped since this tick's check; return why it was not applied."""
+        with self.control.command() as held:
+            if held is not None:
+                return held
+            self.standing, self.last = False, action
+            began_s = time.perf_counter()
+            self.robot.apply(action)
+            self.apply_s.append(time.perf_counter() - began_s)
+        if self.control.held is not None:  # the command may have ended after the stop
+            self.robot.stop()
+        return None
 
 
 def _safe(act: Act) -> Held | None:

@@ -446,7 +446,8 @@ class Watchdog:
         with self._changed:
             self.control.stop(reason)
         self.barks.append(reason)
-        self._stop(reason)
+        with self.control.stopping():
+            self._stop(reason)
 
     def restart(self) -> bool:
         """Allow motion again after a stop; may be called from any thread and from a signal handler.
@@ -503,7 +504,8 @@ class Watchdog:
         """Call `stop`; its error is kept."""
         self.barks.append(reason)
         try:
-            self._stop(reason)
+            with self.control.stopping():
+                self._stop(reason)
         except Exception as error:  # noqa: BLE001 - the next silence must stop the robot as well
             self.error = error
 
