@@ -91,7 +91,8 @@ Connect = Callable[[str | None, RankName | None], RemoteAgent]
 """Connects to the application for one client, with its API key and the most urgent class that the key allows; None
 stands for no key, and for any class."""
 
-POLICY_VIOLATION, INTERNAL_ERROR, TRY_AGAIN_LATER = 1008, 1011, 1013  # WebSocket close codes
+# WebSocket close codes
+POLICY_VIOLATION, INTERNAL_ERROR, SERVICE_RESTART, TRY_AGAIN_LATER = 1008, 1011, 1012, 1013
 _OUR_NAMES = "vlagents"  # preset for clients without a mapping
 
 

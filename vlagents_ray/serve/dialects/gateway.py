@@ -75,8 +75,8 @@ class Gateway:
             raise PolicyUnavailable(f"the gateway no longer accepts clients of {failed}; its log has the details")
 
     async def __del__(self) -> None:
-        for dialect in getattr(self, "_dialects", []):
-            await asyncio.to_thread(dialect.close)
+        closing = [asyncio.to_thread(dialect.close) for dialect in getattr(self, "_dialects", [])]
+        await asyncio.gather(*closing)
 
 
 def wait_for_policy(app: str) -> Contract | None:

@@ -245,10 +245,12 @@ class LeRobotDialect(PortDialect):
         return self._thread.is_alive()
 
     def close(self) -> None:
+        """Refuse further requests, answer those that have arrived, and end all sessions."""
         self._closing.set()
+        stopped = None if self._server is None else self._server.stop(_END_S)  # then it ends the remaining requests
         self._clients.end_all()
-        if self._server is not None:
-            self._server.stop(None).wait(_END_S)
+        if stopped is not None:
+            stopped.wait()
         if self._thread.is_alive():
             self._thread.join(_END_S)
 
@@ -267,7 +269,7 @@ class LeRobotDialect(PortDialect):
 
     def _ready(self, _: bytes, context: Any) -> None:
         if self._closing.is_set():
-            raise PolicyUnavailable("the server is stopping; connect again")
+            raise _stopping()
         if self._ipv4 and context.peer().startswith("ipv6:"):  # gRPC also listens there if the host is 0.0.0.0
             raise Forbidden("this server is for IPv4; connect to such an address, or set dialects.lerobot.host to '::'")
         make = partial(LeRobotConnection, self.context, self.mapping, self.config.checkpoint)
@@ -293,6 +295,8 @@ class LeRobotDialect(PortDialect):
     def _act(self, _: bytes, context: Any) -> bytes | None:
         with self._request(context) as client:
             actions = client.actions()
+        if actions is None and self._closing.is_set():
+            raise _stopping()
         return None if actions is None else lerobot.write_data(actions)
 
     def _request(self, context: Any) -> AbstractContextManager[LeRobotConnection]:
@@ -309,6 +313,10 @@ class LeRobotDialect(PortDialect):
             for context, begun in list(self._uploads.items()):
                 if begun < late:
                     context.cancel()
+
+
+def _stopping() -> PolicyUnavailable:
+    return PolicyUnavailable("the server is stopping; connect again")
 
 
 def _joined(messages: Iterator[bytes], admission: MessageAdmission) -> bytes:

@@ -25,7 +25,7 @@ import numpy as np
 from pydantic import Field
 from starlette.websockets import WebSocket, WebSocketDisconnect
 
-from vlagents_ray.errors import MalformedMessage, TooManyRequests, VLAgentsError, shown
+from vlagents_ray.errors import MalformedMessage, PolicyUnavailable, TooManyRequests, VLAgentsError, shown
 from vlagents_ray.protocol.messages import NAME_CHARACTERS, Reply
 from vlagents_ray.serve.config.dialects import DialectConfig, MappingSetting
 from vlagents_ray.serve.dialects import base
@@ -288,7 +288,10 @@ async def _answer(
             if gate.refused_too_often:
                 await socket.close(base.POLICY_VIOLATION, REFUSED)
             return not gate.refused_too_often
-        await socket.close(base.INTERNAL_ERROR, "Internal server error.")
+        if isinstance(problem, PolicyUnavailable):
+            await socket.close(base.SERVICE_RESTART, str(problem)[:120])
+        else:
+            await socket.close(base.INTERNAL_ERROR, "Internal server error.")
         return False
     finally:
         admission.release()

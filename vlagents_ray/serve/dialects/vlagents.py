@@ -22,6 +22,7 @@ from vlagents_ray.errors import (
     InvalidObservation,
     MalformedMessage,
     MessageTooLarge,
+    PolicyUnavailable,
     VLAgentsError,
     shown,
 )
@@ -55,12 +56,14 @@ class VlagentsConnection:
         self._session = GatewaySessions(context.connect, context.contract)
         self._session.show(NoKey.OPEN, None)  # the protocol has no key, and the deployment accepted that
         self._segments = SharedMemory(same_machine=dialect.config.shared_memory and _is_same_machine(connection))
+        self._sending = threading.Lock()
+        self._unanswered: int | None = None  # sequence number of the request that is being processed
 
     def run(self) -> None:
         """Process the client's requests until it disconnects, is silent for too long, or sends an invalid message."""
         try:
             self._connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-            while (frame := self._receive()) is not None:
+            while not self._dialect.closing and (frame := self._receive()) is not None:
                 if not self._handle(*frame):
                     return
         except (InvalidInput, OSError, ValueError) as error:
@@ -84,8 +87,30 @@ class VlagentsConnection:
             return True
         if call.handler is Handler.CLOSE:
             return False
-        self._send(self._answer(call))
-        return True
+        self._unanswered = call.sequence
+        return self._send_answer(self._answer(call))
+
+    def _send_answer(self, answer: bytes) -> bool:
+        """Answer the current request; return False if `end` has answered it already."""
+        with self._sending:
+            unanswered, self._unanswered = self._unanswered, None
+            if unanswered is not None:
+                self._send(answer)
+        return unanswered is not None
+
+    def stop_reading(self) -> None:
+        """Read no further requests: the connection ends after the answer to the current one. From any thread."""
+        shut_down(self._connection, socket.SHUT_RD)
+
+    def end(self) -> None:
+        """Answer the current request with an error, and end the connection. From any thread."""
+        error = PolicyUnavailable("the server is stopping; connect again")
+        with self._sending:
+            sequence, self._unanswered = self._unanswered, None
+            if sequence is not None:
+                with contextlib.suppress(OSError):  # the client is gone, or does not read
+                    self._send(rpyc.exception(sequence, "RuntimeError", f"{error.code}: {error}"))
+        shut_down(self._connection)
 
     def _answer(self, call: RpycCall) -> bytes:
         try:
@@ -229,10 +254,10 @@ def _is_same_machine(connection: socket.socket) -> bool:
         return False
 
 
-def shut_down(connection: socket.socket) -> None:
-    """Shut a connection down, which wakes the thread that reads from it."""
+def shut_down(connection: socket.socket, directions: int = socket.SHUT_RDWR) -> None:
+    """Shut a connection down, in both directions by default, which wakes the thread that reads from it."""
     with contextlib.suppress(OSError):
-        connection.shutdown(socket.SHUT_RDWR)
+        connection.shutdown(directions)
 
 
 # Access by name to the shared memory of a client on this machine.
@@ -368,7 +393,7 @@ class VlagentsDialect(PortDialect):
         self.parts: Mapping[str, vlagents.Part] | vlagents.Part = {
             name: _part(robot, spec) for name, robot in config.robots.items()
         } or _part(RobotArgs(gripper=config.gripper), spec)
-        self._clients: dict[threading.Thread, socket.socket] = {}
+        self._clients: dict[threading.Thread, VlagentsConnection] = {}
         self._lock = threading.Lock()
         self._closing = threading.Event()
         self._listener: socket.socket | None = None
@@ -388,21 +413,29 @@ class VlagentsDialect(PortDialect):
     def alive(self) -> bool:
         return self._accepting is not None and self._accepting.is_alive()
 
+    @property
+    def closing(self) -> bool:
+        """Whether no further requests are read."""
+        return self._closing.is_set()
+
     def close(self) -> None:
+        """Accept no clients, answer the requests that have arrived, and end all sessions."""
         self._closing.set()
         if self._listener is not None:
             shut_down(self._listener)
         with self._lock:
             clients = dict(self._clients)
-        for connection in clients.values():
-            shut_down(connection)
+        for client in clients.values():
+            client.stop_reading()
         deadline = time.monotonic() + _END_S
         if self._accepting is not None:
             self._accepting.join(_END_S)
         if self._listener is not None:
             self._listener.close()
-        for thread in clients:
+        for thread, client in clients.items():
             thread.join(max(0.0, deadline - time.monotonic()))
+            if thread.is_alive():
+                client.end()
 
     def _accept(self, listener: socket.socket) -> None:
         while not self._closing.is_set():
@@ -419,7 +452,7 @@ class VlagentsDialect(PortDialect):
             with self._lock:
                 full = len(self._clients) >= self.context.sessions
                 if not full:
-                    self._clients[thread] = connection
+                    self._clients[thread] = client
             if full:
                 logger.warning("vlagents: %d clients are connected, the limit; one was refused", self.context.sessions)
                 connection.close()

@@ -1,21 +1,27 @@
-"""Access control of a replica's HTTP paths and WebSockets: API keys, and time limits for slow clients.
+"""Access control of a replica's HTTP paths and WebSockets: API keys, time limits for slow clients, and their end.
 
 The middleware wraps an ASGI application, so that all of its paths, including the dialects, are protected in the same
 way. Two paths require no key: `/healthz` reports only whether the policy is ready, or the step of loading that it has
 reached, and `/live` is a page without data. A WebSocket is refused before it is accepted.
+
+When the client of a WebSocket leaves, the task that serves it is cancelled, as Serve cancels requests over HTTP. None
+of the client's waiting requests is executed then. When the replica stops (`Shutdown`), the messages that have arrived
+are answered before a WebSocket ends.
 """
 
 from __future__ import annotations
 
 import asyncio
 import logging
+import time
 import uuid
-from collections.abc import Collection
+from collections.abc import Awaitable, Callable, Collection
 from contextlib import suppress
 
+from starlette.responses import Response
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
-from vlagents_ray.errors import MalformedMessage, Unauthorized, VLAgentsError
+from vlagents_ray.errors import MalformedMessage, PolicyUnavailable, Unauthorized, VLAgentsError
 from vlagents_ray.protocol.messages import REQUEST_ID_HEADER
 from vlagents_ray.serve.access.api_keys import Caller, Identity, Keys, NoKey, on_behalf_of, token_of
 from vlagents_ray.serve.access.origin_check import require_own_page
@@ -30,8 +36,30 @@ LIVE_PAGE = "/live"  # see `vlagents_ray.serve.observers.live_page`
 
 _TICK_S = 0.5  # period at which a WebSocket's key and time limits are checked
 _DROPPED_BYTES = 2**20  # a connection is closed after a refused request with a longer body
-_GOING_AWAY, _POLICY_VIOLATION = 1001, 1008  # WebSocket close codes
+_GOING_AWAY, _POLICY_VIOLATION, _SERVICE_RESTART = 1001, 1008, 1012  # WebSocket close codes
 _TIMEOUT = 408
+_QUIET_S = 1.0  # time after which a silent connection ends when its replica stops
+_STOPPING = "the replica is stopping; connect again"
+
+
+class Shutdown:
+    """The end of a replica, before which its WebSockets and incomplete uploads end; its methods are thread-safe.
+
+    A WebSocket is a request for Serve, which ends a replica after its last request, and kills it after a time limit.
+    """
+
+    def __init__(self) -> None:
+        self._begun = float("inf")  # time.monotonic(), s
+        self._patience_s = 0.0
+
+    def begin(self, patience_s: float = 0.0) -> None:
+        """End the connections that are silent for a second, and after `patience_s` all of them."""
+        self._begun, self._patience_s = time.monotonic(), patience_s
+
+    def is_due(self, silent_s: float) -> bool:
+        """Return whether a connection has to end whose client has been silent for `silent_s`."""
+        stopping_s = time.monotonic() - self._begun
+        return stopping_s >= self._patience_s or (stopping_s >= 0 and silent_s >= _QUIET_S)
 
 
 class AccessMiddleware:
@@ -47,6 +75,7 @@ class AccessMiddleware:
         idle_s: float = 600.0,
         hosts: Collection[str] = (),
         admission: Admission | None = None,
+        shutdown: Shutdown | None = None,
     ) -> None:
         """Protect `app`.
 
@@ -56,8 +85,9 @@ class AccessMiddleware:
             idle_s: Maximum time that a WebSocket may be silent, s.
             hosts: Further host names of the server, see `require_own_page`.
             admission: The memory in flight of the replica, which also counts incomplete messages of WebSockets.
+            shutdown: The end of the replica; by default it has none.
         """
-        self._admission = admission
+        self._admission, self._shutdown = admission, shutdown or Shutdown()
         self._app, self._keys, self._name = app, keys, name
         self._hosts, self._slow_s, self._idle_s = hosts, slow_s, idle_s
 
@@ -96,7 +126,7 @@ class AccessMiddleware:
                     if isinstance(caller, Caller):
                         caller.hold(-1)
             elif _has_body(scope):
-                await _run_upload(self._app, scope, receive, send, self._slow_s)
+                await _run_upload(self._app, scope, receive, send, self._slow_s, self._shutdown)
             else:
                 await self._app(scope, receive, send)
 
@@ -104,7 +134,7 @@ class AccessMiddleware:
         frames: IncomingFrames | None = scope.get(SCOPE_KEY)
         if frames is not None:
             frames.supervise(caller, self._admission)
-        socket = _TimedWebSocket(caller, self._slow_s, self._idle_s, receive, send, frames)
+        socket = _TimedWebSocket(caller, self._slow_s, self._idle_s, receive, send, frames, self._shutdown)
         await socket.run(self._app, scope)
 
 
@@ -135,21 +165,34 @@ async def _refuse(error: VLAgentsError, request_id: str, scope: Scope, receive: 
     await answer(scope, receive, send)
 
 
-async def _run_upload(app: ASGIApp, scope: Scope, receive: Receive, send: Send, slow_s: float) -> None:
-    """Serve an HTTP request whose body must arrive within `slow_s`."""
-    task = asyncio.current_task()
-    late = answering = False
+async def _run_upload(
+    app: ASGIApp, scope: Scope, receive: Receive, send: Send, slow_s: float, shutdown: Shutdown
+) -> None:
+    """Serve an HTTP request whose body must arrive within `slow_s`, and before the replica stops."""
+    task, loop = asyncio.current_task(), asyncio.get_running_loop()
+    begun = loop.time()
+    refusal: Response | None = None
+    timer: asyncio.TimerHandle
+    answering = False
 
-    def time_out() -> None:
-        nonlocal late
-        late = True
+    def check_time() -> None:
+        nonlocal refusal, timer
+        waited_s = loop.time() - begun
+        if waited_s > slow_s:
+            late = MalformedMessage(f"body: not here within {slow_s:g} s; is the connection that slow?")
+            refusal = problem_response(late, uuid.uuid4().hex, _TIMEOUT)
+        elif shutdown.is_due(waited_s):
+            refusal = problem_response(PolicyUnavailable(_STOPPING), uuid.uuid4().hex)
+        else:
+            timer = loop.call_later(min(_TICK_S, slow_s), check_time)
+            return
         if task is not None:
             task.cancel()
 
-    timer = asyncio.get_running_loop().call_later(slow_s, time_out)
+    timer = loop.call_later(min(_TICK_S, slow_s), check_time)
 
     async def timed() -> Message:
-        _cancel_again(late)
+        _cancel_again(refusal is not None)
         message = await receive()
         if message["type"] == "http.disconnect" or not message.get("more_body", False):
             timer.cancel()
@@ -164,19 +207,21 @@ async def _run_upload(app: ASGIApp, scope: Scope, receive: Receive, send: Send, 
     try:
         await app(scope, timed, answer)
     except asyncio.CancelledError:
-        if not late or answering:
+        if refusal is None or answering:
             raise
         _uncancel(task)
-        error = MalformedMessage(f"body: not here within {slow_s:g} s; is the connection that slow?")
-        response = problem_response(error, uuid.uuid4().hex, _TIMEOUT)
-        response.headers["connection"] = "close"
-        await response(scope, receive, send)
+        refusal.headers["connection"] = "close"
+        await refusal(scope, receive, send)
     finally:
         timer.cancel()
 
 
 class _TimedWebSocket:
-    """A WebSocket that ends when its key becomes invalid, or its client is silent or does not read replies."""
+    """A WebSocket that ends with its client and its replica, and if its key becomes invalid or its client is too slow.
+
+    Messages are read ahead of the application, so that the end of the client is noticed while the application acts.
+    `IncomingFrames` limits the number of messages that the application has not taken.
+    """
 
     def __init__(
         self,
@@ -186,61 +231,103 @@ class _TimedWebSocket:
         receive: Receive,
         send: Send,
         frames: IncomingFrames | None,
+        shutdown: Shutdown,
     ) -> None:
-        self._frames = frames
+        self._frames, self._shutdown = frames, shutdown
         self._caller, self._slow_s, self._idle_s = caller, slow_s, idle_s
         self._receive, self._send = receive, send
         self._loop = asyncio.get_running_loop()
+        self._messages: asyncio.Queue[Message | Exception] = asyncio.Queue()  # read ahead
         self._silent_since: float | None = None  # start of the wait for the next message, s; None if there is no wait
         self._sending_since: float | None = None  # start of the current sending, s; None if there is none
         self._end: tuple[int, str] | None = None  # close code and reason, once the WebSocket has to end
+        self._is_cancelled = False  # whether the application's task was cancelled
+        self._is_closed = False  # whether either side has closed the WebSocket
 
     async def run(self, app: ASGIApp, scope: Scope) -> None:
         task = asyncio.current_task()
 
-        def tick() -> None:
-            self._timer = self._loop.call_later(_TICK_S, tick)  # first, so that an error below cannot stop the checks
-            self._end = self._close_cause()
-            if self._end is not None and task is not None:
-                self._timer.cancel()
+        def cancel() -> None:
+            self._is_cancelled = True
+            if task is not None:
                 task.cancel()
 
+        def tick() -> None:
+            self._timer = self._loop.call_later(_TICK_S, tick)  # first, so that an error below cannot stop the checks
+            if (cause := self._close_cause()) is not None:
+                self._end = cause
+                self._timer.cancel()
+                cancel()
+            elif self._end is None and self._shutdown.is_due(self._silent_s()):
+                self._end = _SERVICE_RESTART, _STOPPING
+                self._messages.put_nowait({"type": "websocket.disconnect", "code": _SERVICE_RESTART})
+
         self._timer = self._loop.call_later(_TICK_S, tick)
+        reading = self._loop.create_task(self._read_ahead(cancel))
         try:
             await app(scope, self._timed_receive, self._timed_send)
         except asyncio.CancelledError:
-            if self._end is None:
+            if not self._is_cancelled:
                 raise
             _uncancel(task)
-            code, reason = self._end
-            logger.info("a WebSocket is closed: %s", reason)
-            with suppress(asyncio.TimeoutError, RuntimeError):  # the client does not read, or closed the connection
-                closing = self._send({"type": "websocket.close", "code": code, "reason": reason[:120]})
-                await asyncio.wait_for(closing, _TICK_S)
         finally:
             self._timer.cancel()
+            reading.cancel()
+        if self._end is not None and not self._is_closed:
+            await self._close(*self._end)
+
+    async def _close(self, code: int, reason: str) -> None:
+        logger.info("a WebSocket is closed: %s", reason)
+        closing: Awaitable[None]
+        if self._frames is not None and self._frames.arriving_s > 0:
+            closing = self._frames.end(code, reason)
+        else:
+            closing = self._send({"type": "websocket.close", "code": code, "reason": reason[:120]})
+        with suppress(asyncio.TimeoutError, RuntimeError):  # the client does not read, or closed the connection
+            await asyncio.wait_for(closing, _TICK_S)
+
+    async def _read_ahead(self, client_left: Callable[[], None]) -> None:
+        while True:
+            try:
+                message = await self._receive()
+            except Exception as error:  # noqa: BLE001 - raised where the application receives
+                self._messages.put_nowait(error)
+                return
+            self._messages.put_nowait(message)
+            if message["type"] == "websocket.disconnect":
+                if not self._is_closed:
+                    self._is_closed = True
+                    client_left()
+                return
 
     async def _timed_receive(self) -> Message:
-        _cancel_again(self._end is not None)
+        _cancel_again(self._is_cancelled)
         self._silent_since = self._loop.time()
-        message = await self._receive()
+        message = await self._messages.get()
         self._silent_since = None
+        if isinstance(message, Exception):
+            raise message
         if self._frames is not None and message["type"] == "websocket.receive":
             self._frames.taken()
         return message
 
     async def _timed_send(self, message: Message) -> None:
+        self._is_closed = self._is_closed or message["type"] == "websocket.close"
         self._sending_since = self._loop.time()
         await self._send(message)
         self._sending_since = None
 
+    def _silent_s(self) -> float:
+        """Return for how long the application has waited for a message, s; 0 while it acts."""
+        return 0.0 if self._silent_since is None else self._loop.time() - self._silent_since
+
     def _close_cause(self) -> tuple[int, str] | None:
-        now = self._loop.time()
-        if self._sending_since is not None and now - self._sending_since > self._slow_s:
+        """Return the close code and the reason if the WebSocket has to end at once."""
+        if self._sending_since is not None and self._loop.time() - self._sending_since > self._slow_s:
             return _POLICY_VIOLATION, "replies are not taken"
         if self._frames is not None and self._frames.arriving_s > self._slow_s:
             return _POLICY_VIOLATION, f"a message took longer than {self._slow_s:g} s"
-        if self._silent_since is not None and now - self._silent_since > self._idle_s:
+        if self._silent_s() > self._idle_s:
             return _GOING_AWAY, "silent for too long"
         if isinstance(self._caller, Caller) and (reason := self._caller.refusal()) is not None:
             return _POLICY_VIOLATION, reason

@@ -102,6 +102,15 @@ class IncomingFrames(asyncio.Protocol):
         with contextlib.suppress(RuntimeError):  # the event loop is closed
             self._loop.call_soon_threadsafe(self._note_taken)
 
+    async def end(self, code: int, reason: str) -> None:
+        """End a connection with a part of a message, behind which uvicorn would not find the client's close frame."""
+
+        async def end() -> None:
+            self._discard_rest()
+            self._end(code, reason)
+
+        await asyncio.wrap_future(asyncio.run_coroutine_threadsafe(end(), self._loop))
+
     @property
     def arriving_s(self) -> float:
         """Time since which a part of a message waits for its rest, s; 0 if there is none."""

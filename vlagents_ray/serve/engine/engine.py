@@ -269,8 +269,11 @@ class Engine:
         """Refuse all requests except those of the running batch, and wait at most `timeout_s` for its end."""
         with suppress(Exception):  # the policy is loading, or its GPU has too little memory for it to wake
             self.weights.rest(Rest("wake"))
+        stopping = PolicyUnavailable("the replica is stopping; connect again")
+        if self._failure is None:
+            self._unready = stopping  # otherwise the end of the policy's thread would be taken for a failure
         for pending in self.queue.close():
-            self._fail(pending, PolicyUnavailable("the replica is stopping; connect again"))
+            self._fail(pending, stopping)
         if self._thread.ident is None:
             self.queue.poller.close()
         elif self._thread is not threading.current_thread():

@@ -27,7 +27,7 @@ from vlagents_ray.serve.access.api_keys import NoKey, require_access, warn_of_pl
 from vlagents_ray.serve.access.audit import write_audit
 from vlagents_ray.serve.config.deployment import ServerArgs
 from vlagents_ray.serve.dialects.base import ReplicaContext, dialect_routes
-from vlagents_ray.serve.endpoints.access_middleware import AccessMiddleware
+from vlagents_ray.serve.endpoints.access_middleware import AccessMiddleware, Shutdown
 from vlagents_ray.serve.endpoints.connection import Admit
 from vlagents_ray.serve.endpoints.http import build_http_app
 from vlagents_ray.serve.endpoints.plasma import PlasmaServer
@@ -57,6 +57,7 @@ _WATCH_S = 0.25
 _LOCKED_S = 1.0  # delay after a call's limit, which `notice_hung` reports unless the interpreter's lock is held
 _STDERR = 2
 _GATEWAY_POLL_S = 10.0
+_LEAVE_S = 5.0  # time in which clients of a draining replica connect to another one before their WebSockets are closed
 _CATCH_UP_S = 10.0  # interval of the checks whether this replica has missed a version of the weights
 
 
@@ -85,6 +86,7 @@ class PolicyReplica(ClientApi, SiblingApi):
         if self._keys is not None and not settings.access.plain_http:
             warn_of_plain_http(_plain_host())
         self._tasks: list[asyncio.Task[None]] = []
+        self._shutdown = Shutdown()
 
         # The engine, and its parts that are shared with other replicas.
         self._peers = SiblingReplicas()
@@ -212,6 +214,7 @@ class PolicyReplica(ClientApi, SiblingApi):
             idle_s=idle_s,
             hosts=hosts,
             admission=self._engine.admission,
+            shutdown=self._shutdown,
         )
 
     def metadata(self) -> dict[str, Any]:
@@ -322,6 +325,7 @@ class PolicyReplica(ClientApi, SiblingApi):
     async def _watch_shutdown(self) -> None:
         """Drain the engine as soon as Serve stops this replica, if other replicas can take its clients.
 
+        The WebSockets end, since Serve waits for them before it calls `close`, and kills the replica after a while.
         Before that, detect a policy that hangs. A policy that holds the interpreter's lock also blocks this task; in
         that case a thread that needs no lock writes the stack traces into the log.
         """
@@ -332,6 +336,7 @@ class PolicyReplica(ClientApi, SiblingApi):
         faulthandler.cancel_dump_traceback_later()
         if await asyncio.to_thread(_others_run):
             self._engine.drain()
+        self._shutdown.begin(_LEAVE_S if self._engine.draining else 0.0)
 
     async def _keep_catching_up(self) -> None:
         """Get the other replicas' versions of the weights whenever this replica has missed one."""

@@ -1,0 +1,108 @@
+"""What a client gets when its server stops, and what becomes of its acts when it leaves, at each endpoint."""
+
+from __future__ import annotations
+
+import contextlib
+import threading
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import pytest
+from eval_fakes import wait_for
+from leaving_clients import ACTED, BOUND_S, CLIENTS, GATEWAYS, HELD, OTHERS, LeavingClient, StoppableServer, seconds_of
+
+from vlagents_ray.registry import DIALECTS, dialect_class
+from vlagents_ray.serve.dialects.base import RouteDialect
+
+SITUATIONS = ("idle", "in flight", "waiting", "half a message")
+BRIGHTNESS = {"in flight": HELD + 1, "waiting": 3}  # of the act
+EACH = [
+    pytest.param(name, situation, id=f"{name}, {situation}")
+    for name in CLIENTS
+    for situation in SITUATIONS
+    if (name, situation) != ("shared memory", "half a message")  # datagrams arrive as a whole
+]
+
+
+@dataclass
+class Scene:
+    server: StoppableServer
+    client: LeavingClient
+    situation: str
+
+    @property
+    def acts(self) -> list[int]:
+        """The acts that the policy has executed for the client since its first one."""
+        return [brightness for brightness in self.server.policy.acted if brightness == BRIGHTNESS.get(self.situation)]
+
+
+@contextlib.contextmanager
+def scene(name: str, situation: str) -> Iterator[Scene]:
+    """A client of a server, in this situation."""
+    with contextlib.ExitStack() as stack:
+        server = StoppableServer(stack)
+        stack.callback(server.policy.gate.set)
+        client = CLIENTS[name](server)
+        if situation == "waiting":
+            server.hold_policy()
+        queued = len(server.queued)
+        if situation in BRIGHTNESS:
+            client.send(BRIGHTNESS[situation])
+            wait_for(lambda: len(server.queued) > queued, BOUND_S)
+        if situation == "in flight":
+            assert server.policy.entered.wait(BOUND_S)
+        if situation == "half a message":
+            client.send_half()
+        yield Scene(server, client, situation)
+
+
+@pytest.mark.parametrize(("name", "situation"), EACH)
+def test_a_server_that_stops_leaves_no_client_waiting(name: str, situation: str) -> None:
+    """It answers what it has accepted, and closes WebSockets with 1012 and a reason."""
+    with scene(name, situation) as at:
+        stopping = threading.Thread(target=at.server.stop)
+        stopping.start()
+        wait_for(at.server.is_stopping, BOUND_S)
+        at.server.policy.gate.set()
+        if situation in BRIGHTNESS:
+            answer = at.client.answer()
+            assert answer in ((ACTED,) if situation == "in flight" else (ACTED, "unavailable"))
+            assert at.acts == ([BRIGHTNESS[situation]] if answer == ACTED else [])
+        if at.client.closes_with_code:
+            assert at.client.end() == "1012 the replica is stopping; connect again"
+        elif not name.startswith("POST"):
+            assert at.client.end() in ("ended", "unavailable", "connection_lost")
+        elif situation == "half a message":
+            assert at.client.end() == "unavailable"
+        assert seconds_of(lambda: stopping.join(BOUND_S)) < BOUND_S
+
+
+@pytest.mark.parametrize(("name", "situation"), EACH)
+def test_no_act_is_executed_for_a_client_that_left_before_it_began(name: str, situation: str) -> None:
+    """A gateway notices only after an act that its client has left; that client's acts end with its session."""
+    with scene(name, situation) as at:
+        of_client = [request for request in at.server.queued if request.session_id not in OTHERS]
+        at.client.leave()
+        if situation == "waiting" and name not in GATEWAYS:
+            wait_for(lambda: all(request.over or request.origin.ended for request in of_client), BOUND_S)
+        at.server.policy.gate.set()
+        for op in ("reset", "act"):
+            at.server.ask(OTHERS[1], op)
+        if situation == "waiting" and name not in GATEWAYS:
+            assert at.acts == []
+        assert len(at.acts) <= 1
+        if at.client.closes_with_code or name in ("shared memory", "vlagents"):
+            wait_for(lambda: set(OTHERS).issuperset(at.server.engine.sessions.ids()), BOUND_S)
+
+
+def test_the_table_has_each_endpoint() -> None:
+    ports = {name for name in DIALECTS if not issubclass(dialect_class(name), RouteDialect)}
+    assert ports == {name.lower() for name in GATEWAYS}
+    paths = {
+        path
+        for name in DIALECTS
+        if issubclass(cls := dialect_class(name), RouteDialect)
+        for path, method in cls.paths.items()
+        if method in ("stream", "act")
+    }
+    assert paths <= set(CLIENTS)

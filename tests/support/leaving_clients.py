@@ -1,0 +1,552 @@
+"""A replica and its gateways in this process, and a client of each endpoint that acts, sends half a message, leaves."""
+
+from __future__ import annotations
+
+import abc
+import contextlib
+import http.client
+import json
+import queue
+import socket
+import threading
+import time
+from collections.abc import Callable
+from concurrent.futures import Future, ThreadPoolExecutor
+from functools import partial
+from types import SimpleNamespace
+from typing import Any
+
+import grpc
+import msgpack
+import numpy as np
+from asgi_server import served
+from dialect_server import ALL, METADATA, body, image, libero, seen
+from eval_fakes import wait_for
+from gr00t_client import PolicyClient, encode
+from in_flight import pending
+from in_process_replicas import InProcess
+from lerobot_messages import AsyncClient, parts_of, pickled, robot_saw
+from rpyc_client import Client as RpycClient
+from rpyc_client import call, document
+from starlette.types import ASGIApp, Message, Receive, Scope, Send
+from websockets.exceptions import ConnectionClosed
+from websockets.frames import Frame, Opcode
+from websockets.sync.client import connect
+
+from vlagents_ray.client.agent import RemoteAgent
+from vlagents_ray.client.connection import Connection
+from vlagents_ray.client.credentials import Credentials
+from vlagents_ray.client.transports.base import CodecChoice
+from vlagents_ray.client.transports.shm import ShmTransport
+from vlagents_ray.errors import ConnectionLost, VLAgentsError
+from vlagents_ray.interface import Act, Agent, Obs
+from vlagents_ray.protocol.frames import decode_replies, encode_requests
+from vlagents_ray.protocol.messages import Limits, RankName, Reply, Request
+from vlagents_ray.registry import dialect_class
+from vlagents_ray.serve.access.api_keys import NoKey
+from vlagents_ray.serve.config.dialects import DialectArgs
+from vlagents_ray.serve.dialects.base import GatewayContext, PortDialect, ReplicaContext, dialect_routes
+from vlagents_ray.serve.endpoints.access_middleware import AccessMiddleware, Shutdown
+from vlagents_ray.serve.endpoints.front import FrontMiddleware
+from vlagents_ray.serve.endpoints.http import build_http_app
+from vlagents_ray.serve.endpoints.shm import ShmServer
+from vlagents_ray.serve.endpoints.websocket import WebSocketServer
+from vlagents_ray.serve.engine.engine import Engine
+from vlagents_ray.serve.ports import free_port, reserve
+from vlagents_ray.wire import vla_eval as vla_eval_codec
+
+BOUND_S = 5.0  # nothing waits for longer
+HELD = 250  # the policy acts on pictures from this brightness on when its gate opens
+OTHERS = ("another", "a third")  # sessions of other clients
+SLOW_S = 0.02  # of each act, so that another thread reads the connections while the policy acts
+ACTED = "acted"
+LIMITS = Limits(body_bytes=2**20)
+
+
+class Acts(list[int]):
+    """The brightness of the pictures that a policy has acted on, in all sessions."""
+
+
+class GatedPolicy(Agent):
+    """Notes the brightness of the pictures that it has acted on."""
+
+    def __init__(self) -> None:
+        self.acted = Acts()
+        self.entered = threading.Event()
+        self.gate = threading.Event()
+
+    def shared_objects(self) -> list[object]:
+        return [self.acted, self.entered, self.gate]
+
+    def reset(self, obs: Obs, instruction: str | None, **kwargs: Any) -> dict[str, Any]:
+        return {}
+
+    def act(self, obs: Obs) -> Act:
+        brightness = max(int(picture[0, 0, 0]) for picture in obs.cameras.values())
+        if brightness >= HELD:
+            self.entered.set()
+            self.gate.wait(BOUND_S)
+        time.sleep(SLOW_S)
+        self.acted.append(brightness)
+        return Act(np.zeros(8, np.float32))
+
+
+class StoppableServer:
+    """A replica that stops as one in Serve does, and the gateways, which stop at the same time."""
+
+    def __init__(self, stack: contextlib.ExitStack) -> None:
+        self.stack = stack
+        self.policy = GatedPolicy()
+        self.engine = Engine(self.policy, max_batch_size=1)
+        self.queued: list[Any] = []  # each request that was queued
+        put = self.engine.queue.put
+
+        def noted(*requests: Any) -> None:
+            self.queued.extend(requests)
+            put(*requests)
+
+        self.engine.queue.put = noted  # type: ignore[method-assign]
+        self.own = WebSocketServer(self.engine, LIMITS, "127.0.0.1", None, NoKey.OPEN)
+        self.near = ShmServer(self.engine, LIMITS, NoKey.OPEN)
+        self.own.open()
+        self.near.open()
+        self.engine.start()
+        self.shutdown = Shutdown()
+        self.requests = 0  # of HTTP, and WebSockets, that are under way
+        routes = dialect_routes(DialectArgs(**ALL), ReplicaContext(self.engine, lambda: METADATA, LIMITS))
+        inside = build_http_app(self.engine, lambda: METADATA, LIMITS, more=routes)
+        guarded = AccessMiddleware(inside, None, "app", admission=self.engine.admission, shutdown=self.shutdown)
+        self.port = stack.enter_context(served(FrontMiddleware(self._as_in_serve(guarded))))
+        self.gateways: dict[str, PortDialect] = {}
+        self.ports = {name: self._gateway(name) for name in ("gr00t", "vlagents", "lerobot")}
+        self._stopped = False
+        stack.callback(self.stop)
+
+    def hold_policy(self) -> None:
+        """Let the policy act for another client until its gate opens."""
+        for session in OTHERS:
+            self.ask(session, "reset")
+        while not self.engine.queue.window.overlaps:
+            for session in OTHERS:
+                self.ask(session, "act")
+        self._send(OTHERS[0], "act", HELD)
+        assert self.policy.entered.wait(BOUND_S)
+
+    def ask(self, session: str, op: Any) -> None:
+        """Reset or act in a session of another client, after all requests that wait."""
+        assert self._send(session, op, 1).get(timeout=BOUND_S).error is None
+
+    def _send(self, session: str, op: Any, brightness: int) -> queue.SimpleQueue[Reply]:
+        replies: queue.SimpleQueue[Reply] = queue.SimpleQueue()
+        request = Request(op, Obs({"front": image(brightness)}))
+        self.engine.submit([pending(session, request, replies.put)])
+        return replies
+
+    def is_stopping(self) -> bool:
+        """Whether all parts of the server have begun to stop that can begin before the policy's gate opens."""
+        gateways = self.gateways.values()
+        closing = all((getattr(one, "_stopping", None) or one._closing).is_set() for one in gateways)  # type: ignore[attr-defined]
+        return closing and (self.requests > 0 or self.engine.queue._closed)
+
+    def stop(self) -> None:
+        """Stop the replica as Serve and `PolicyReplica` do: first what keeps Serve from ending it."""
+        if self._stopped:
+            return
+        self._stopped = True
+        with ThreadPoolExecutor() as threads:
+            closing = [threads.submit(dialect.close) for dialect in self.gateways.values()]
+            self.shutdown.begin()
+            wait_for(lambda: not self.requests, BOUND_S)
+            self.engine.close()
+            for endpoint in (self.own, self.near):
+                endpoint.close()
+            for closed in closing:
+                closed.result()
+
+    def _as_in_serve(self, app: ASGIApp) -> ASGIApp:
+        """Count the requests that are under way; cancel one of HTTP when its client leaves, as Serve does."""
+
+        async def run(scope: Scope, receive: Receive, send: Send) -> None:
+            import asyncio
+
+            self.requests += 1
+            try:
+                if scope["type"] != "http":
+                    await app(scope, receive, send)
+                    return
+                messages: asyncio.Queue[Message] = asyncio.Queue()
+
+                async def read() -> None:
+                    message: Message = {}
+                    while message.get("type") != "http.disconnect":
+                        message = await receive()
+                        messages.put_nowait(message)
+
+                reading = asyncio.ensure_future(read())
+                answering = asyncio.ensure_future(app(scope, messages.get, send))
+                await asyncio.wait({reading, answering}, return_when=asyncio.FIRST_COMPLETED)
+                reading.cancel()
+                if not answering.done():
+                    answering.cancel()
+                with contextlib.suppress(asyncio.CancelledError):
+                    await answering
+            finally:
+                self.requests -= 1
+
+        return run
+
+    def _gateway(self, name: str) -> int:
+        cls, port = dialect_class(name), free_port()
+        context = GatewayContext("app", self._agent, LIMITS, 100, 30.0, None, NoKey.OPEN)
+        dialect = cls(name, cls.Config(port=port), context)
+        dialect.serve(reserve(name, "127.0.0.1", port))
+        self.gateways[name] = dialect
+        return port
+
+    def _agent(self, _key: str | None, rank: RankName | None) -> RemoteAgent:
+        agent = RemoteAgent("http://127.0.0.1:9", rank=rank or "robot")
+        engines: Any = SimpleNamespace(
+            engines=[self.engine], dead=set(), frozen=set(), prefer=0, lose_reply=False, stopping=False, frames=[]
+        )
+        transport = InProcess(engines)
+        agent._connection = Connection(agent.url, lambda: transport, CodecChoice("raw"), 5.0, 5.0)
+        return agent
+
+
+class LeavingClient(abc.ABC):
+    """One client, which has a session in which it has acted once."""
+
+    closes_with_code = False  # whether its connection is a WebSocket
+
+    def __init__(self, server: StoppableServer) -> None:
+        self.server = server
+
+    @abc.abstractmethod
+    def send(self, brightness: int) -> None:
+        """Send an act, without waiting for the answer."""
+
+    @abc.abstractmethod
+    def answer(self) -> str:
+        """Wait for the answer, which is `ACTED` or the code of an error."""
+
+    @abc.abstractmethod
+    def send_half(self) -> None:
+        """Send half of the message of an act."""
+
+    @abc.abstractmethod
+    def end(self) -> str:
+        """Wait until the server has ended the connection; returns the close code and its reason, if it has them."""
+
+    @abc.abstractmethod
+    def leave(self) -> None:
+        """End the connection at once."""
+
+
+class WebSocketClient(LeavingClient):
+    closes_with_code = True
+
+    def __init__(
+        self,
+        server: StoppableServer,
+        path: str,
+        message: Callable[[int], bytes],
+        read: Callable[[bytes | str], str],
+        opening: bytes = b"",
+        greets: bool = False,
+    ) -> None:
+        super().__init__(server)
+        self._message, self._read = message, read
+        port = server.port
+        if path == "own":
+            port, path = server.own.address.port, server.own.address.path
+        url = f"ws://127.0.0.1:{port}{path}"
+        self._socket = server.stack.enter_context(connect(url, compression=None, ping_interval=None, close_timeout=0.1))
+        if greets:
+            self._socket.recv(BOUND_S)
+        if opening:
+            self._socket.send(opening)
+            self._socket.recv(BOUND_S)
+        self.send(2)
+        assert self.answer() == ACTED
+
+    def send(self, brightness: int) -> None:
+        self._socket.send(self._message(brightness))
+
+    def answer(self) -> str:
+        return self._read(self._socket.recv(BOUND_S))
+
+    def send_half(self) -> None:
+        frame = Frame(Opcode.BINARY, self._message(2)).serialize(mask=True)
+        self._socket.socket.sendall(frame[: len(frame) // 2])
+
+    def end(self) -> str:
+        try:
+            while True:
+                self._socket.recv(BOUND_S)
+        except ConnectionClosed as closed:
+            return "no close code" if closed.rcvd is None else f"{closed.rcvd.code} {closed.rcvd.reason}"
+
+    def leave(self) -> None:
+        self._socket.socket.shutdown(socket.SHUT_RDWR)
+
+
+class HttpClient(LeavingClient):
+    def __init__(self, server: StoppableServer, path: str, document: Callable[[int], bytes], kind: str) -> None:
+        super().__init__(server)
+        self._path, self._document = path, document
+        self._headers = {"x-session-id": "robot-1", "content-type": kind}
+        self._connection = http.client.HTTPConnection("127.0.0.1", server.port, timeout=BOUND_S)
+        server.stack.callback(self._connection.close)
+        if path == "/v1/act":
+            reset = encode_requests([Request("reset", Obs({"front": image(2)}))])
+            self._connection.request("POST", "/v1/reset", reset, self._headers)
+            assert self._connection.getresponse().read()
+        self.send(2)
+        assert self.answer() == ACTED
+
+    def send(self, brightness: int) -> None:
+        self._connection.request("POST", self._path, self._document(brightness), self._headers)
+
+    def answer(self) -> str:
+        response = self._connection.getresponse()
+        content = response.read()
+        return ACTED if response.status == 200 else str(json.loads(content)["code"])
+
+    def send_half(self) -> None:
+        document = self._document(2)
+        self._connection.putrequest("POST", self._path)
+        for name, value in {**self._headers, "content-length": str(len(document))}.items():
+            self._connection.putheader(name, value)
+        self._connection.endheaders(document[: len(document) // 2])
+
+    def end(self) -> str:
+        return self.answer()  # of the half message: an idle connection ends with the process
+
+    def leave(self) -> None:
+        self._connection.sock.shutdown(socket.SHUT_RDWR)
+
+
+class ThreadedClient(LeavingClient):
+    """A client whose calls wait for the answer, and therefore run on a thread."""
+
+    def __init__(self, server: StoppableServer) -> None:
+        super().__init__(server)
+        self._threads = ThreadPoolExecutor(1)
+        self._answer: Future[str] = Future()
+
+    def send(self, brightness: int) -> None:
+        self._answer = self._threads.submit(self.act, brightness)
+
+    def answer(self) -> str:
+        return self._answer.result(BOUND_S)
+
+    @abc.abstractmethod
+    def act(self, brightness: int) -> str: ...
+
+
+class ShmClient(ThreadedClient):
+    def __init__(self, server: StoppableServer) -> None:
+        super().__init__(server)
+        self._transport = ShmTransport(server.near.address, Credentials(""))
+        self._transport.connect(BOUND_S)
+        server.stack.callback(self._transport.close)
+        self._transport.call([Request("reset", Obs({"front": image(2)}), request_id="0")], BOUND_S)
+        assert self.act(2) == ACTED
+
+    def act(self, brightness: int) -> str:
+        request = Request("act", Obs({"front": image(brightness)}), request_id=str(brightness))
+        try:
+            error = self._transport.call([request], BOUND_S)[0].error
+        except VLAgentsError as raised:
+            error = raised
+        return ACTED if error is None else error.code
+
+    def send_half(self) -> None:
+        """Do nothing: a datagram is sent as a whole."""
+
+    def end(self) -> str:
+        while (code := self.act(2)) != ConnectionLost.code:
+            assert code != ACTED
+        return code
+
+    def leave(self) -> None:
+        self._transport._socket.shutdown(socket.SHUT_RDWR)  # type: ignore[union-attr]
+
+
+class Gr00tClient(LeavingClient):
+    def __init__(self, server: StoppableServer) -> None:
+        super().__init__(server)
+        self._client = server.stack.enter_context(PolicyClient(server.ports["gr00t"], timeout_ms=int(BOUND_S * 1e3)))
+        self.send(2)
+        assert self.answer() == ACTED
+
+    def send(self, brightness: int) -> None:
+        observation = {
+            "video": {"ego": np.full((1, 1, 8, 8, 3), brightness, np.uint8)},
+            "state": {"arm": np.zeros((1, 1, 3), np.float32)},
+            "language": {"task": [["a task"]]},
+        }
+        data = {"observation": observation, "options": None}
+        self._client.socket.send(msgpack.packb({"endpoint": "get_action", "data": data}, default=encode))
+
+    def answer(self) -> str:
+        reply = msgpack.unpackb(self._client.socket.recv())
+        return str(reply["error"]).partition(":")[0] if isinstance(reply, dict) and "error" in reply else ACTED
+
+    def send_half(self) -> None:
+        address = "127.0.0.1", self.server.ports["gr00t"]
+        self._half = self.server.stack.enter_context(socket.create_connection(address, timeout=BOUND_S))
+        self._half.sendall(b"\xff\0\0\0\0\0\0\0\1\x7f")  # the first part of ZeroMQ's greeting
+
+    def end(self) -> str:
+        if hasattr(self, "_half"):
+            return _end_of(self._half)
+        return "ended"  # ZeroMQ connects again by itself, and shows no end of a connection
+
+    def leave(self) -> None:
+        self._client.close()
+
+
+class VlagentsClient(LeavingClient):
+    def __init__(self, server: StoppableServer) -> None:
+        super().__init__(server)
+        self._client = server.stack.enter_context(RpycClient(server.ports["vlagents"], BOUND_S))
+        self.send(2)
+        assert self.answer() == ACTED
+
+    def send(self, brightness: int) -> None:
+        self._client.send(call("act", document(brightness)))
+
+    def answer(self) -> str:
+        kind, _, content = self._client.receive()
+        return ACTED if kind == 2 else str(content[1][0]).partition(":")[0]
+
+    def send_half(self) -> None:
+        message = call("act", document(2))
+        self._client.send(message[: len(message) // 2])
+
+    def end(self) -> str:
+        return _end_of(self._client.socket)
+
+    def leave(self) -> None:
+        self._client.socket.shutdown(socket.SHUT_RDWR)
+
+
+class LeRobotClient(LeavingClient):
+    def __init__(self, server: StoppableServer) -> None:
+        super().__init__(server)
+        self._client = server.stack.enter_context(AsyncClient(server.ports["lerobot"])).begin()
+        self._timestep = 0
+        self._half_sent = threading.Event()
+        self.send(2)
+        assert self.answer() == ACTED
+
+    def send(self, brightness: int) -> None:
+        self._client.send(robot_saw(self._timestep, pixel=brightness))
+        self._timestep += 1
+        self._actions = self._client.get.future(b"", timeout=BOUND_S)
+
+    def answer(self) -> str:
+        return self._outcome(self._actions)
+
+    def send_half(self) -> None:
+        parts = list(parts_of(pickled(robot_saw(self._timestep)), 40))
+        arrived = threading.Event()
+
+        def half() -> Any:
+            yield from parts[: len(parts) // 2]
+            arrived.set()
+            self._half_sent.wait(BOUND_S)
+
+        self._sending = self._client.send_parts.future(half(), timeout=BOUND_S)
+        assert arrived.wait(BOUND_S)
+
+    def end(self) -> str:
+        if hasattr(self, "_sending"):
+            outcome = self._outcome(self._sending)
+            self._half_sent.set()
+            return outcome
+        return self._outcome(self._client.get.future(b"", timeout=BOUND_S))
+
+    def leave(self) -> None:
+        self._client.channel.close()
+
+    @staticmethod
+    def _outcome(call: Any) -> str:
+        try:
+            return ACTED if call.result() else "no actions"
+        except grpc.RpcError as error:
+            return str(error.code().name).lower()  # type: ignore[attr-defined]
+
+
+def _end_of(connection: socket.socket) -> str:
+    connection.settimeout(BOUND_S)
+    with contextlib.suppress(ConnectionResetError):
+        while connection.recv(2**16):
+            pass
+    return "ended"
+
+
+def _frame(op: Any, brightness: int) -> bytes:
+    return encode_requests([Request(op, Obs({"front": image(brightness)}))])
+
+
+def _read_frame(data: bytes | str) -> str:
+    assert isinstance(data, bytes)
+    error = decode_replies(data)[0].error
+    return ACTED if error is None else error.code
+
+
+def _read_map(data: bytes | str) -> str:
+    if isinstance(data, bytes):
+        assert b"actions" in data
+        return ACTED
+    return "unavailable" if "stopping" in data else data
+
+
+def _see(brightness: int) -> bytes:
+    return vla_eval_codec.encode(vla_eval_codec.Message("observation", seen(brightness), brightness))
+
+
+def _read_vla_eval(data: bytes | str) -> str:
+    assert isinstance(data, bytes)
+    return str(vla_eval_codec.decode(data).payload.get("code", ACTED))
+
+
+def _arena(brightness: int) -> bytes:
+    return libero(brightness, endpoint="infer", session_id="a")
+
+
+Connect = Callable[[StoppableServer], LeavingClient]
+_opened = partial(WebSocketClient, message=partial(_frame, "act"), read=_read_frame, opening=_frame("reset", 2))
+CLIENTS: dict[str, Connect] = {
+    "own port": partial(_opened, path="own"),
+    "WS /v1/stream": partial(_opened, path="/v1/stream"),
+    "WS /openpi": partial(WebSocketClient, path="/openpi", message=libero, read=_read_map, greets=True),
+    "WS /roboarena": partial(WebSocketClient, path="/roboarena", message=_arena, read=_read_map, greets=True),
+    "WS /vla-eval": partial(WebSocketClient, path="/vla-eval", message=_see, read=_read_vla_eval),
+    "POST /v1/act": partial(
+        HttpClient,
+        path="/v1/act",
+        document=partial(_frame, "act"),
+        kind="application/x-vlagents-frame",
+    ),
+    "POST /act": partial(
+        HttpClient,
+        path="/act",
+        document=lambda brightness: json.dumps(body(brightness)).encode(),
+        kind="application/json",
+    ),
+    "shared memory": ShmClient,
+    "GR00T": Gr00tClient,
+    "vlagents": VlagentsClient,
+    "LeRobot": LeRobotClient,
+}
+GATEWAYS = ("GR00T", "vlagents", "LeRobot")
+
+
+def seconds_of(call: Callable[[], Any]) -> float:
+    """The duration of a call, s."""
+    begun = time.perf_counter()
+    call()
+    return time.perf_counter() - begun
