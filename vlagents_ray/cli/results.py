@@ -185,8 +185,13 @@ def verify_command(
             for one in found.findings:
                 rows.add_row(one.subject, one.verdict, one.detail)
             out.print(rows)
-            out.print(f"\nreplayed episodes were drawn by --seed {found.seed}")
-            out.print(f"bundle sha256:{found.digest}: {'holds' if found.holds else 'is contradicted'}")
+            unchecked = [one.subject for one in found.findings if one.verdict == "not checked"]
+            verdict = "is contradicted" if not found.holds else "holds"
+            if unchecked:
+                verdict += f"; not checked: {', '.join(unchecked)}"
+            if "replay" not in unchecked:
+                out.print(f"\nreplayed episodes were drawn by --seed {found.seed}")
+            out.print(f"bundle sha256:{found.digest}: {verdict}")
             if into is not None:
                 out.print(f"results: {into}")
     raise typer.Exit(not found.holds)
@@ -235,7 +240,7 @@ def replay_command(
             raise ConfigError(f"{folder}: holds results, and wants an episode: its key, or ENV#NUMBER")
         from vlagents_ray.cli.evaluation import play_one
         from vlagents_ray.evaluate import Results
-        from vlagents_ray.evaluate.replay import compare, find, rounding
+        from vlagents_ray.evaluate.replay import actions_difference, compare, find
 
         recorded = find(Results.load(folder), episode)
         other: dict[str, Any] | None = (
@@ -244,13 +249,14 @@ def replay_command(
         into = out_dir or fresh(folder / "replays" / "replay")
         summary = play_one(recorded.config(into, policy=other), address, recorded.number_and_seed)
         found = compare(recorded, summary.results)
-        largest = rounding(recorded, summary.results)
+        difference = actions_difference(recorded, summary.results)
         steps = recorded.episode.result.steps
         same = f"the same: {steps} actions byte for byte, and what came of them"
-        if largest:
+        if difference is not None:
             same = (
-                f"the same up to rounding: {steps} actions that differ by at most {largest:.2g}, as in batches of "
-                f"another size, and what came of them"
+                f"the same up to rounding: {steps} actions, and what came of them; the first to differ is that of step "
+                f"{difference.step}, by {difference.at_first:.2g}, as in batches of another size, later ones differ by "
+                f"at most {difference.largest:.2g}"
             )
         for line in [*(found or [same]), f"replay: {into}"]:
             out.print(line)

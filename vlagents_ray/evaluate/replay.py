@@ -16,7 +16,24 @@ from vlagents_ray.evaluate.plan.config import EvalConfig
 from vlagents_ray.evaluate.results.reader import CellResults, Episode, Results
 
 _FEW = 5  # names in a message
-ROUNDING = 1e-5  # of an action of 1 or less, else relative: more than a batch of another size changes, about 1e-7
+# Largest differences of actions of 1 or less, else relative. At the first step that differs, a batch of another size
+# changes 1e-7 to 1e-5. Later steps amplify that, since each observation depends on the actions before it.
+ROUNDING = 1e-4
+DRIFT = 1e-2
+
+
+@dataclass(frozen=True, slots=True)
+class ActionsDifference:
+    """By how much the actions of two episodes of one length differ: absolutely, or relatively to numbers above 1."""
+
+    step: int  # the first that differs; the observations until then were the same
+    at_first: float  # the largest of a number of that step's action
+    largest: float  # of all steps
+
+    @property
+    def is_rounding(self) -> bool:
+        """Whether another rounding explains the difference, at the first step and as it grew later."""
+        return self.at_first <= ROUNDING and self.largest <= DRIFT
 
 
 @dataclass(frozen=True, slots=True)
@@ -83,17 +100,18 @@ def find(results: Results, name: str) -> Recorded:
 def compare(recorded: Recorded, replayed: Results) -> list[str]:
     """Return the differences of the replay, a sentence each; empty if it is the same episode up to rounding.
 
-    Actions that differ in their bytes are the same if no number differs by more than `ROUNDING` (see `rounding`), and
-    so are then their returns. Durations are not compared. Raises `ConfigError` if infrastructure failed the replay.
+    Actions that differ in their bytes are the same if that `is_rounding` (see `actions_difference`), and so are then
+    returns that differ by no more than `DRIFT`. Durations are not compared. Raises `ConfigError` if infrastructure
+    failed the replay.
     """
     [[again]] = [cell.episodes for cell in replayed.cells]
     if again.result.status == "infra_failed":
         raise ConfigError(f"the replay did not end, so that there is nothing to compare: {again.result.error}")
     before, now = recorded.episode.result.outcome, again.result.outcome
-    rounded = rounding(recorded, replayed)
-    is_rounding = rounded is not None and 0 < rounded <= ROUNDING
+    difference = actions_difference(recorded, replayed)
+    is_rounding = difference is not None and difference.is_rounding
     returns = before["episode_return"], now["episode_return"]
-    if is_rounding and math.isclose(*returns, rel_tol=ROUNDING, abs_tol=ROUNDING):
+    if is_rounding and math.isclose(*returns, rel_tol=DRIFT, abs_tol=DRIFT):
         now = now | {"episode_return": before["episode_return"]}
     found = [
         f"{name}: {before[name]!r} was recorded, now it is {now[name]!r}"
@@ -110,15 +128,15 @@ def compare(recorded: Recorded, replayed: Results) -> list[str]:
     return found
 
 
-def rounding(recorded: Recorded, replayed: Results) -> float | None:
-    """Return the largest difference of a number of an action, in units of the number if that is above 1.
+def actions_difference(recorded: Recorded, replayed: Results) -> ActionsDifference | None:
+    """Return by how much the replayed actions differ.
 
     Returns:
-        0 if the actions are equal byte for byte; None if their numbers differ, or a trajectory is missing.
+        None if they are equal byte for byte, if their numbers differ, or if a trajectory is missing.
     """
     [[again]] = [cell.episodes for cell in replayed.cells]
     if recorded.episode.result.actions_sha256 == again.result.actions_sha256:
-        return 0.0
+        return None
     paths = [
         None if one.trajectory is None else results.file(one.trajectory)
         for results, one in ((recorded.results, recorded.episode), (replayed, again))
@@ -128,7 +146,9 @@ def rounding(recorded: Recorded, replayed: Results) -> float | None:
     before, now = (Trajectory.load(path).actions.astype(np.float64) for path in paths if path is not None)
     if before.shape != now.shape:
         return None
-    return float(np.max(np.abs(before - now) / np.maximum(1.0, np.abs(before)), initial=0.0))
+    by_step = np.max(np.abs(before - now) / np.maximum(1.0, np.abs(before)), axis=1)
+    step = int(np.argmax(by_step > 0))
+    return ActionsDifference(step, float(by_step[step]), float(by_step.max()))
 
 
 def _actions(recorded: Recorded, replayed: Path) -> str:
