@@ -206,6 +206,13 @@ def _require_fit(
     trained = None if options.trained_on is None else Trained.read(options.trained_on)
     fit = fit_of(agent, robot, limits, trained=trained, accept=options.accept_misfit)
     is_default = options.robot is None and options.ros is None
+    if fit.trained == Trained() and not is_default:
+        text = (
+            "the policy states no ranges of its training, so this arm's pose and the first chunk are not compared with "
+            "them; --trained-on FILE names them"
+        )
+        say(text)
+        logger.info("%s", text)
     if fit.compares and not (is_default and trained is None):
         obs = robot.observe()
         agent.reset(obs, options.instruction)

@@ -377,6 +377,13 @@ class Stored(Agent):
         find_checkpoint(str(self.file)).read_bytes()
 
 
+class Computed(Agent):
+    """Has no files."""
+
+    def __init__(self, weights: dict[str, str | None] | None) -> None:
+        self.weights_id = weights
+
+
 def test_what_is_loaded_is_told_by_its_digest_in_the_metadata_and_with_each_reset(tmp_path: Path) -> None:
     """Of files that `find_checkpoint` found, or what the agent says itself."""
     file = tmp_path / "weights.pt"
@@ -395,14 +402,27 @@ def test_what_is_loaded_is_told_by_its_digest_in_the_metadata_and_with_each_rese
             engine.close()
 
 
-def test_the_statistics_of_the_training_are_in_the_metadata_of_the_weights(tmp_path: Path) -> None:
-    (tmp_path / "weights.pt").write_bytes(b"1")
-    agent = Stored(tmp_path / "weights.pt", {"digest": "mine", "revision": None})
+@pytest.mark.parametrize(
+    ("weights", "expected"),
+    [
+        ({"digest": "mine", "revision": None}, {"digest": "mine", "revision": None}),
+        (None, {"digest": None, "revision": None}),
+    ],
+    ids=["with a digest", "without a digest"],
+)
+def test_the_statistics_of_the_training_are_in_the_metadata_of_the_weights(
+    weights: dict[str, str | None] | None, expected: dict[str, str | None]
+) -> None:
+    """A robot is compared with them, whether or not the policy identifies its weights."""
+    agent = Computed(weights)
     agent.statistics = {"action": {"min": [0.0], "max": [1.0]}}
     engine = Engine(agent)
     engine.start()
     try:
-        assert engine.models.weights == {"digest": "mine", "revision": None, "statistics": agent.statistics}
+        assert engine.models.weights == {**expected, "statistics": agent.statistics}
+        reply = begin(engine, "s").get(timeout=10)
+        assert reply.error is None
+        assert reply.info.get("weights") == expected["digest"]
     finally:
         engine.close()
 

@@ -82,9 +82,9 @@ def changed(known: Mapping[str, Any], now: Mapping[str, Any], *, swept: bool) ->
 def policy_changes(subject: str, known: Mapping[str, Any], now: Mapping[str, Any], *, swept: bool) -> list[Change]:
     """Compare the files and the weights that two metadata of a policy's server state; the weights come last."""
     found = program_changes(subject, policy_program(known, swept=swept), policy_program(now, swept=swept))
-    before, after = known.get("weights"), now.get("weights")
-    if not swept and before and after and before["digest"] != after["digest"]:
-        found.append(Change(subject, "weights", before["digest"], after["digest"]))
+    before, after = ((metadata.get("weights") or {}).get("digest") for metadata in (known, now))
+    if not swept and before and after and before != after:
+        found.append(Change(subject, "weights", before, after))
     return found
 
 

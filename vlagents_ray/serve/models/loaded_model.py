@@ -109,7 +109,7 @@ class LoadedModel:
     contract: Contract | None
     copies: AgentCopies
     padding: Padding
-    weights: dict[str, Any] | None  # digest and revision, see `Agent.weights_id`
+    weights: dict[str, Any] | None  # digest and revision, see `Agent.weights_id`, and `Agent.statistics`
     files: Program  # digests of the files named in its settings
     version: tuple[str, str]  # equal in replicas that can take over each other's sessions of this model
     calls: PolicyCalls  # running calls of the replica, including those of this agent
@@ -239,8 +239,8 @@ class Loader:
             files = files_named({**named, CHOICE: resolved(named)}, folders=not weights)
             if weights is None and files:
                 weights = {"digest": digest_of(files), "revision": None}
-            if weights is not None and agent.statistics is not None:
-                weights = {**weights, "statistics": agent.statistics}
+            if agent.statistics is not None:  # also of weights that have no digest, for the comparison with a robot
+                weights = {"digest": None, "revision": None, **(weights or {}), "statistics": agent.statistics}
             contract = agent.contract
             self._check(contract)
             copies = AgentCopies(agent)
@@ -249,13 +249,13 @@ class Loader:
             _close_agent(agent)
             raise
         padding = Padding(() if report.pads else self._batch_sizes, copies.make)
-        version = (self.version(settings), f"{copies.fingerprint} {weights['digest'] if weights else ''}")
-        if weights is not None:
-            logger.info("weights: %s, revision: %s", weights["digest"], weights.get("revision"))
+        digest = (weights or {}).get("digest") or ""
+        version = (self.version(settings), f"{copies.fingerprint} {digest}")
+        if weights is not None and digest:
+            logger.info("weights: %s, revision: %s", digest, weights.get("revision"))
         busy = threading.Lock()
-        digest = ((weights or {}).get("digest") or "").rpartition(":")[2][:DIGITS]
         make = agent.model_weights if isinstance(agent, HoldsWeights) else partial(ModelWeights, agent)
-        parameters = make(busy, digest, version)
+        parameters = make(busy, digest.rpartition(":")[2][:DIGITS], version)
         calls = self._calls
         return LoadedModel(
             choice, settings, agent, contract, copies, padding, weights, files, version, calls, parameters, busy, report
