@@ -16,6 +16,7 @@ from in_process_replicas import Replicas
 
 from vlagents_ray.envs.base import BatchEnv, SequentialBatch
 from vlagents_ray.errors import ConfigError, ConnectionLost, EnvFailed, PolicyFailed, UnknownEnv
+from vlagents_ray.evaluate import EvalConfig
 from vlagents_ray.evaluate.episode.failures import Failure
 from vlagents_ray.evaluate.plan.cases import cells
 from vlagents_ray.evaluate.plan.jobs import Job, plan
@@ -61,7 +62,12 @@ def pool(monkeypatch: pytest.MonkeyPatch) -> type[Workers]:
     monkeypatch.setattr(Workers, "dying", 0)
     monkeypatch.setattr(Workers, "played", [])
     monkeypatch.setattr(rollout, "FIRST_WAIT_S", 0.001)
-    monkeypatch.setattr(rollouts, "workers_class", lambda _config, _stack: Workers)
+
+    def workers_class(config: EvalConfig, _stack: object) -> type[InProcessWorkers]:
+        # Without workers the real class plays, as this one would wait for a worker that it does not start.
+        return Workers if config.workers else InProcessWorkers
+
+    monkeypatch.setattr(rollouts, "workers_class", workers_class)
     return Workers
 
 
@@ -148,9 +154,12 @@ def test_the_replay_is_a_column() -> None:
     np.testing.assert_array_equal(got["replay.tokens"][:, 0], np.rint(100 * got["action"]))
 
 
-def test_groups_of_several_envs_share_no_number_and_no_two_episodes_of_an_env_share_a_policy_seed() -> None:
+@pytest.mark.parametrize("workers", [0, 2])
+def test_groups_of_several_envs_share_no_number_and_no_two_episodes_of_an_env_share_a_policy_seed(
+    workers: int,
+) -> None:
     envs = [LINE, "eval_fakes:OtherLine"]
-    with Rollouts(RolloutPlan(envs, ToZero, groups=3, workers=2, seed=10)) as found:
+    with Rollouts(RolloutPlan(envs, ToZero, groups=3, workers=workers, seed=10)) as found:
         got = [arrays(batch) for batch in itertools.islice(found, 24)]
     groups: dict[int, list[str]] = {}
     seeds: dict[str, list[int]] = {}
