@@ -11,9 +11,12 @@ from typing import Any
 import numpy as np
 import pytest
 from arm_models import simulated_arm
+from ros_arm import COMMANDS, JOINTS, Wire, header
 
 from vlagents_ray import ActionSpec, Contract
 from vlagents_ray.robot.lerobot_robot import LeRobotRobot, OneAtATime
+from vlagents_ray.robot.ros import RosRobot
+from vlagents_ray.robot.ros.robot import settings_from
 from vlagents_ray.robot.simulated import SimulatedRobot
 
 MOTORS = ("shoulder", "elbow", "gripper")
@@ -166,6 +169,81 @@ def test_a_locked_bus_is_still_a_bus() -> None:
     bus.sync_write("Goal_Position", {"elbow": 1.0})
     assert bus.goals == {"elbow": 1.0}
     assert not hasattr(bus, "unknown")
+
+
+class Finger(Wire):
+    """A link to an arm whose finger is one of the joints of its topics."""
+
+    def open(self) -> None:
+        self.deliver(*POSE.tolist())
+
+    def deliver(self, *joints: float) -> None:
+        state = {"header": header(), "name": list(MOTORS), "position": np.array(joints)}
+        for topic in (JOINTS, FINGER):
+            self.takes[topic](state)
+
+
+FINGER = "/finger"
+TRAJECTORY = "trajectory_msgs/msg/JointTrajectory"
+ARRAY = "std_msgs/msg/Float64MultiArray"
+STATE = "sensor_msgs/msg/JointState"
+ROS_TOPICS: dict[str, dict[str, Any]] = {  # the topic of the actions
+    "trajectory": {"type": TRAJECTORY, "names": list(MOTORS), "stop": "joints"},
+    "joint state": {"type": STATE, "names": list(MOTORS), "stop": "joints"},
+    "numbers in the order of the state": {"type": ARRAY, "numbers": 3, "stop": "joints"},
+    "numbers, stated": {"type": ARRAY, "numbers": 3, "stop": "unnamed", "grippers": [2]},
+    "deltas": {"type": STATE, "names": list(MOTORS), "stop": "zeros"},
+    "deltas, stated": {"type": ARRAY, "numbers": 3, "stop": "zeros", "grippers": [2]},
+}
+
+
+def ros_robot(topic: str) -> tuple[RosRobot, Finger]:
+    wire = Finger()
+    stated = {
+        "link": "ws://arm",
+        "state": {"joints": {"topic": JOINTS, "names": list(MOTORS)}, "unnamed": {"topic": JOINTS}},
+        "gripper": {"topic": FINGER, "names": ["gripper"], "open": 100.0, "closed": 0.0},
+        "actions": [{"topic": COMMANDS, **ROS_TOPICS[topic]}],
+        "max_age_s": 60.0,
+        "silent_s": 60.0,
+    }
+    return RosRobot(settings_from(stated, "arm.yaml"), wire), wire
+
+
+def last_goal(wire: Finger) -> list[float]:
+    message = wire.published[-1][1]
+    if "points" in message:
+        message = message["points"][0]
+    [goal] = [message[key] for key in ("positions", "position", "data") if key in message]
+    return list(goal)
+
+
+@pytest.mark.parametrize("commanded", [False, True])
+@pytest.mark.parametrize("topic", ROS_TOPICS)
+def test_a_robot_behind_topics_stops_where_it_is_and_keeps_its_grasp(topic: str, *, commanded: bool) -> None:
+    robot, wire = ros_robot(topic)
+    with robot:
+        robot.observe()
+        if commanded:
+            robot.apply(np.array([20.0, 5.0, GRASP], np.float32))
+        for _ in range(3):
+            robot.stop()
+        arm = [0.0, 0.0] if "deltas" in topic else POSE[:2].tolist()
+        assert last_goal(wire) == pytest.approx([*arm, GRASP if commanded else POSE[2]])
+
+
+def test_a_robot_behind_topics_without_a_recent_pose_stays_as_it_is() -> None:
+    robot, wire = ros_robot("trajectory")
+    with robot:
+        robot.observe()
+        robot.apply(np.array([20.0, 5.0, GRASP], np.float32))
+        wire.connections = 2  # all messages are from before a loss
+        robot.observe()
+        robot.stop()
+        assert len(wire.published) == 1
+        wire.deliver(13.0, -3.0, 31.0)
+        robot.observe()  # the stop is sent as soon as the pose is known
+        assert last_goal(wire) == pytest.approx([13.0, -3.0, GRASP])
 
 
 @pytest.mark.parametrize("delta", [False, True])

@@ -47,6 +47,7 @@ class RosArm(threading.Thread):
         self.poses: list[list[float]] = []  # all that it has been in
         self.broken: set[str] = set()  # topics that it does not publish on
         self.images = 0
+        self.varies = True  # whether each picture differs, as by the noise of a sensor
         self._publish, self._commands = publish, commands
         self._over = threading.Event()
 
@@ -73,10 +74,44 @@ class RosArm(threading.Thread):
         return {"header": header(), "name": ["gripper", "elbow", "shoulder"], "position": numbers}
 
     def _image(self) -> dict[str, Any]:
-        self.images += 1
+        self.images += self.varies
         pixels = np.full((SIDE, SIDE, 3), self.images % 256, np.uint8)
         said = {"height": SIDE, "width": SIDE, "encoding": "bgr8", "is_bigendian": 0, "step": 3 * SIDE}
         return {"header": header(), **said, "data": pixels.tobytes()}
+
+
+class Wire:
+    """A link whose messages a test delivers."""
+
+    name, up, connections = "rosbridge", True, 1
+
+    def __init__(self) -> None:
+        self.takes: dict[str, Callable[[Any], None]] = {}
+        self.published: list[tuple[str, dict[str, Any]]] = []
+
+    def subscribe(self, topic: str, kind: str, take: Callable[[Any], None]) -> None:
+        self.takes[topic] = take
+
+    def advertise(self, topic: str, kind: str) -> None: ...
+
+    def open(self) -> None:
+        self.deliver(0.0, 0.0)
+
+    def publish(self, topic: str, message: dict[str, Any]) -> bool:
+        self.published.append((topic, message))
+        return True
+
+    def close(self) -> None: ...
+
+    def deliver(self, *joints: float) -> None:
+        arm = RosArm(lambda topic, message: self.takes[topic](message), list)
+        arm.joints = list(joints)
+        self.takes[JOINTS](arm._state())
+        self.takes[CAMERA](arm._image())
+
+    @property
+    def commands(self) -> list[list[float]]:
+        return [message["data"] for topic, message in self.published if topic == COMMANDS]
 
 
 def header() -> dict[str, Any]:

@@ -383,6 +383,9 @@ class _Suite:
         """Find cameras that repeat one picture; the noise of a sensor changes each picture, also of a still scene."""
         if getattr(self._robot, "simulated", False):
             return
+        if getattr(self._robot, "dates_pictures", False):
+            self._check_new_dates()
+            return
         first = {name: picture.copy() for name, picture in self._observe().cameras.items()}
         began_s, still = self._clock.monotonic(), set(first)
         while still and self._clock.monotonic() - began_s < _FROZEN_S:
@@ -396,6 +399,17 @@ class _Suite:
                 "simulated robot declares `simulated = True`"
             )
             self.find("cameras", got, "new pictures, which differ by the noise of the sensor", cure)
+
+    def _check_new_dates(self) -> None:
+        """Find a sensor that gives nothing new, by the time stamps; a simulation may render one picture repeatedly."""
+        began_s = self._clock.monotonic()
+        began_at = self._clock.time()
+        while self._observe().info[CAPTURED] < began_at:
+            if self._clock.monotonic() - began_s > _FROZEN_S:
+                got = getattr(self._robot, "holds", None) or f"nothing newer than {_FROZEN_S:g} s from a sensor"
+                self.find("cameras", got, "new pictures and states", "restart the driver of this sensor")
+                return
+            self._clock.sleep(self._period_s)
 
     def _check_cameras(self) -> None:
         if any(finding.check == "cameras" for finding in self.report.findings):
@@ -617,7 +631,8 @@ def _undeclared(contract: Contract) -> str:
     return (
         f"the motion cannot be checked, as {what}. Give the class a `contract`, such as "
         f"Contract(state={{'joints': StateSpec(6, 'rad')}}, action=ActionSpec(dim=6, space='joint', delta=False)), "
-        f"or check by the contract of a policy (--policy URL), as topics of ROS state no meaning; see docs/arms.md"
+        f"or check by the contract of a policy (--policy URL); topics of ROS state only targets, by a measured pose as "
+        f"their `stop`; see docs/arms.md"
     )
 
 

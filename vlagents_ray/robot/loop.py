@@ -53,8 +53,10 @@ class Robot(Protocol):
 
     `vlagents-ray robot`, its `check` and `vlagents_ray.robot.check.examine` use further attributes of a robot that has
     them: `contract`, what it gives and takes; `joint_names`, its joints in the order of an action, without grippers;
-    `joint_limits`, (D, 2) in their units; of a simulated one `operator`, a `vlagents_ray.robot.check.Operator` in place
-    of the person at the robot, and `clock`, the module `time` of its simulation; and `close`, called at the end.
+    `joint_limits`, (D, 2) in their units; `dates_pictures`, whether `captured_at` is from the time stamps of its
+    sensors, so that a camera that hangs is found by them; of a simulated one `operator`, a
+    `vlagents_ray.robot.check.Operator` in place of the person at the robot, and `clock`, the module `time` of its
+    simulation; and `close`, called at the end.
     """
 
     def observe(self) -> Obs:

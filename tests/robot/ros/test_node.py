@@ -6,8 +6,8 @@ import contextlib
 import re
 import threading
 from collections import deque
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass, field
+from collections.abc import Iterator
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -17,13 +17,15 @@ import ros_arm
 import yaml
 from asgi_server import policy_server
 from eval_fakes import wait_for
-from ros_arm import BEAT, CAMERA, COMMANDS, JOINTS, NAMES, SIDE, RosArm, header
+from ros_arm import BEAT, CAMERA, COMMANDS, JOINTS, NAMES, SIDE, RosArm, Wire, header
 from rosbridge_double import RosbridgeDouble, rosbridge_double
 
 import vlagents_ray.cli.robot as command
 from vlagents_ray import Act, ActionSpec, Agent, CameraSpec, ChunkPlayer, Contract, Obs, PlayerSettings, StateSpec
-from vlagents_ray.errors import ConfigError, InvalidAction
+from vlagents_ray.contract import require_match
+from vlagents_ray.errors import ConfigError, ContractMismatch, InvalidAction
 from vlagents_ray.robot import Guard, Watchdog, run_loop
+from vlagents_ray.robot.check import examine
 from vlagents_ray.robot.loop import LoopReport
 from vlagents_ray.robot.ros import RosRobot
 from vlagents_ray.robot.ros.robot import settings_from
@@ -222,40 +224,6 @@ def test_a_lost_rosbridge_holds_the_arm_and_tells_it_so_as_soon_as_it_is_back() 
     assert drive.reports[0].reasons["robot"] == "the connection to the rosbridge was lost"
 
 
-class Wire:
-    """A link whose messages a test delivers."""
-
-    name, up, connections = "rosbridge", True, 1
-
-    def __init__(self) -> None:
-        self.takes: dict[str, Callable[[Any], None]] = {}
-        self.published: list[tuple[str, dict[str, Any]]] = []
-
-    def subscribe(self, topic: str, kind: str, take: Callable[[Any], None]) -> None:
-        self.takes[topic] = take
-
-    def advertise(self, topic: str, kind: str) -> None: ...
-
-    def open(self) -> None:
-        self.deliver(0.0, 0.0)
-
-    def publish(self, topic: str, message: dict[str, Any]) -> bool:
-        self.published.append((topic, message))
-        return True
-
-    def close(self) -> None: ...
-
-    def deliver(self, *joints: float) -> None:
-        arm = RosArm(lambda topic, message: self.takes[topic](message), list)
-        arm.joints = list(joints)
-        self.takes[JOINTS](arm._state())
-        self.takes[CAMERA](arm._image())
-
-    @property
-    def commands(self) -> list[list[float]]:
-        return [message["data"] for topic, message in self.published if topic == COMMANDS]
-
-
 def test_a_stop_into_a_dead_connection_is_sent_again_at_the_pose_after_the_loss() -> None:
     wire = Wire()
     with RosRobot(settings_from(ros_arm.settings("ws://dead"), "arm.yaml"), wire) as robot:
@@ -371,24 +339,49 @@ def test_a_policy_for_another_robot_is_refused(tmp_path: Path, capsys: pytest.Ca
     assert "camera 'front': the policy needs it, the env gives ['top']" in capsys.readouterr().err
 
 
+@pytest.mark.parametrize("stop", ["joints", "nothing"])
 @pytest.mark.parametrize("declared", [False, True])
 def test_the_check_of_a_robot_behind_topics_moves_nothing(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, *, declared: bool
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, stop: str, *, declared: bool
 ) -> None:
-    """Topics do not state whether their numbers are targets; the contract of a policy does."""
+    """Numbers that the measured pose stops are targets; of others only the contract of a policy states it."""
     monkeypatch.setattr("builtins.input", lambda _: "")  # the person cannot tell
     with ahead_server(Ahead()) as port, rosbridge_double() as double:
-        (tmp_path / "arm.yaml").write_text(yaml.safe_dump(ros_arm.settings(double.url)))
+        settings = ros_arm.settings(double.url)
+        settings["actions"][0]["stop"] = stop
+        (tmp_path / "arm.yaml").write_text(yaml.safe_dump(settings))
         policy = ["--policy", f"http://127.0.0.1:{port}"] if declared else []
         with RosArm(double.publish, lambda: double.on(COMMANDS)):
             status = command.main(["check", "--ros", str(tmp_path / "arm.yaml"), "--hz", "20", *policy])
-        assert status == (0 if declared else 3)
+        states_meaning = declared or stop == "joints"
+        assert status == (0 if states_meaning else 3)
         assert len({tuple(one["data"]) for one in double.on(COMMANDS)}) <= 1, "stops, with the measured pose"
     printed = capsys.readouterr().out
     assert "ok observation" in printed
     assert "not checked cameras" in printed
     assert re.search("^not checked .*order", printed, re.MULTILINE)
-    assert ("NOT CHECKED" in printed) == ("--policy URL" in printed) == (not declared)
+    assert ("NOT CHECKED" in printed) == ("--policy URL" in printed) == (not states_meaning)
+
+
+@pytest.mark.parametrize("camera", ["of a simulation", "that hangs"])
+def test_only_a_camera_without_new_messages_is_frozen(camera: str) -> None:
+    with rosbridge_double() as double, RosArm(double.publish, lambda: double.on(COMMANDS)) as arm:
+        settings = settings_from(ros_arm.settings(double.url, max_age_s=0.3), "arm.yaml")
+        arm.varies = False  # a simulation without noise renders one picture while nothing moves
+        with RosRobot(settings) as robot:
+            if camera == "that hangs":
+                arm.broken = {CAMERA}
+            report = examine(robot, hz=20.0)
+    frozen = [finding for finding in report.findings if finding.check in ("cameras", "clock")]
+    assert bool(frozen) == (camera == "that hangs"), report.lines()
+    assert all(finding.check != "cameras" or CAMERA in finding.got for finding in frozen)
+
+
+def test_a_policy_of_deltas_is_refused_by_topics_of_targets() -> None:
+    with RosRobot(settings_from(ros_arm.settings("ws://arm"), "arm.yaml"), Wire()) as robot:
+        deltas = replace(Ahead().contract, action=ActionSpec(dim=2, delta=True))
+        with pytest.raises(ContractMismatch, match="delta"):
+            require_match(deltas, robot.contract)
 
 
 def test_an_action_of_another_length_is_not_published() -> None:

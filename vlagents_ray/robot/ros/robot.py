@@ -63,6 +63,7 @@ class ActionTopic:
     values: Values = "position"  # field of a JointState
     fields: tuple[str, ...] = TWIST  # of a Twist
     reach_s: float = 0.1  # time in which the arm should reach the point of a JointTrajectory
+    grippers: tuple[int, ...] | None = None  # which of its numbers; None: the joints of the gripper's topic
 
     @property
     def dim(self) -> int:
@@ -102,6 +103,24 @@ class RosSettings:
     def dim(self) -> int:
         """The count of numbers of an action."""
         return sum(command.dim for command in self.actions)
+
+    @property
+    def delta(self) -> bool | None:
+        """Whether actions are relative: False if the measured pose stops the robot, as their numbers are targets then.
+
+        Else it is None: zeros stop velocities as well as deltas, and a topic without a stop states nothing.
+        """
+        stops = {command.stop for command in self.actions} - {NOTHING}
+        return False if stops and stops <= self.state.keys() else None
+
+    def gripper_columns(self, command: ActionTopic) -> list[int]:
+        """Return which numbers of a topic are grippers; joints are compared by name with those of `gripper`."""
+        if command.grippers is not None:
+            return list(command.grippers)
+        measured = self.state.get(command.stop)
+        names = command.names or (() if measured is None else measured.names)
+        fingers = () if self.gripper is None else self.gripper.names
+        return [number for number, name in enumerate(names) if name in fingers]
 
 
 def read_settings(file: Path | str) -> RosSettings:
@@ -190,6 +209,13 @@ def _check_command(command: ActionTopic, settings: RosSettings, where: str) -> N
         )
     if command.stop and command.stop not in (ZEROS, NOTHING):
         _one_of(f"{where}: stop", command.stop, (ZEROS, NOTHING, *settings.state))
+    for number in command.grippers or ():
+        _one_of(f"{where}: grippers", number, tuple(range(command.dim)))
+    if command.grippers and command.stop == ZEROS and settings.gripper is None:
+        raise ConfigError(
+            f"{where}: grippers: got {list(command.grippers)} in a topic that zeros stop, and no `gripper`; add the "
+            f"topic of its opening, as a stop publishes that in place of a zero"
+        )
 
 
 def _reading(stated: Any, where: str, kind: str, usual: Mapping[str, Any]) -> InputTopic:
@@ -204,6 +230,10 @@ def _made(kind: type[Any], stated: Any, where: str) -> Any:
         if not isinstance(value, list) or not all(isinstance(one, str) for one in value):
             raise ConfigError(f"{where}: {name}: got {value!r}, want a list of names")
         given[name] = tuple(value)
+    if (grippers := given.get("grippers")) is not None:
+        if not isinstance(grippers, list) or not all(type(number) is int for number in grippers):
+            raise ConfigError(f"{where}: grippers: got {grippers!r}, want a list of numbers from 0, such as [2]")
+        given["grippers"] = tuple(grippers)
     require_arguments(where, kind, given)
     return kind(**given)
 
@@ -293,6 +323,9 @@ class RosRobot:
         link: The link to them; by default that of the settings.
     """
 
+    dates_pictures = True
+    """Whether `captured_at` is from the messages, so that a camera that hangs is found by the age of its picture."""
+
     def __init__(self, settings: RosSettings, link: Link | None = None) -> None:
         self.settings = settings
         self.holds: str | None = None
@@ -304,6 +337,7 @@ class RosRobot:
         self._connections = 0
         self._lost_at = -math.inf  # s of `time.monotonic`
         self._stop_unsent = False
+        self._commanded: dict[int, np.ndarray] = {}  # the last numbers of each topic of the actions, by its place
         for topic, kind in {reading.topic: reading.type for reading in settings.sensors}.items():
             self._link.subscribe(topic, kind, partial(self._take, topic))
         for command in settings.actions:
@@ -347,7 +381,7 @@ class RosRobot:
             cameras={name: CameraSpec(*image.shape[:2]) for name, image in cameras.items()},
             state={name: StateSpec(len(part)) for name, part in state.items()},
             gripper=self.settings.gripper is not None,
-            action=ActionSpec(dim=self.settings.dim),
+            action=ActionSpec(dim=self.settings.dim, delta=self.settings.delta),
         )
 
     def observe(self) -> Obs:
@@ -373,25 +407,43 @@ class RosRobot:
         if action.shape != (self.settings.dim,):
             raise InvalidAction(f"action: got {action.shape}, want ({self.settings.dim},), as the topics take")
         first = 0
-        for command in self.settings.actions:
-            self._publish(command, action[first : first + command.dim])
+        for place, command in enumerate(self.settings.actions):
+            row = self._commanded[place] = action[first : first + command.dim].copy()
+            self._publish(command, row)
             first += command.dim
 
     def stop(self) -> None:
-        """Publish the stop of each topic: zeros, or the measured pose if that is recent."""
+        """Publish the stop of each topic: zeros, or the measured pose if that is recent.
+
+        Grippers keep their last command, as the measured opening would loosen their grasp.
+        """
         self._stop_unsent = not self._link.up  # if so, it is sent on reconnection
-        for command in self.settings.actions:
+        for place, command in enumerate(self.settings.actions):
+            if command.stop == NOTHING:
+                continue
+            grippers = self.settings.gripper_columns(command)
             if command.stop in ("", ZEROS):
-                self._publish(command, np.zeros(command.dim, np.float32))
-            elif command.stop != NOTHING:
+                row = np.zeros(command.dim, np.float32)
+                row[grippers] = self._measured_opening()
+            else:
                 reading = self.settings.state[command.stop]
                 reader = self._readers[id(reading)]
                 reader.refresh()
                 if reader.age_s > reading.max_age_s or self._from_before_loss(reader):
                     self._stop_unsent = True  # until a pose is known
-                    logger.warning("%s: not told where to stop, as %s is old", command.topic, reading.topic)
-                else:
-                    self._publish(command, reader.value)
+                    logger.warning("%s: no stop was published, as the pose of %s is old", command.topic, reading.topic)
+                    continue
+                row = reader.value.copy()
+            if place in self._commanded:
+                row[grippers] = self._commanded[place][grippers]
+            self._publish(command, row)
+
+    def _measured_opening(self) -> float:
+        """Return the opening of the gripper in the numbers of its topic; 0 without such a topic."""
+        reading = self.settings.gripper
+        if reading is None or reading.open is None or reading.closed is None:
+            return 0.0
+        return float(reading.closed + self._value(reading) * (reading.open - reading.closed))
 
     def _from_before_loss(self, reader: TopicReader) -> bool:
         return time.monotonic() - self._lost_at <= reader.age_s < math.inf
