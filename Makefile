@@ -1,6 +1,6 @@
 # The same words on a laptop and in CI. `make setup` needs Python 3.11 and no root.
 #
-#   make setup [PYTHON=...] [TORCH_INDEX_URL=...] [TORCH_CUDA=1]     the environment, in .venv
+#   make setup [PYTHON=...] [TORCH_INDEX_URL=...] [TORCH_CUDA=1] [PLUGINS="sims …"]     the environment, in .venv
 #   make demo                                                       serve a policy, evaluate it, show the table
 #   make check                                                      lint, types, layers, quick tests: no Ray, torch, simulator
 #   make test [TEST_PROCESSES=3]                                    lint, types, layers, all tests but integrations
@@ -28,6 +28,8 @@ SHELL := /bin/bash
 
 VENV ?= .venv
 TORCH ?= torch==2.13.0
+# Those of plugins/vlagents_ray_NAME that `make setup` installs beside the core.
+PLUGINS ?= arro sims
 TORCH_INDEX_URL ?=
 TORCH_CUDA ?=
 PYTHON ?= $(shell for python in python3.11 python3; do \
@@ -42,6 +44,7 @@ BIN := $(VENV)/bin
 PIP := $(BIN)/python -m pip --disable-pip-version-check
 CONSTRAINTS := $(VENV)/constraints.txt
 STAMP := $(VENV)/.installed
+PROJECTS := pyproject.toml $(PLUGINS:%=plugins/vlagents_ray_%/pyproject.toml)
 # `make check`, `lint`, `type` and `fmt` do with a smaller environment where the whole one is not installed.
 TOOLS := $(if $(wildcard $(STAMP)),$(VENV),$(VENV)-check)
 # On two cores: tests wait for a third of their time, those of `make check` for half of it.
@@ -49,14 +52,15 @@ TEST_PROCESSES ?= 3
 CHECK_PROCESSES ?= 4
 # Marked so: what wants more than Python, takes long, or wants the machine for itself (pyproject.toml, tests/support/needs.py).
 NOT_QUICK := ray or server or hosts or sim or vulkan or torch or gpu or browser or node or compiler or alone or slow or integration
-# Environments of model families: requirements/NAME.txt, in $(VENV)-NAME. What is tested in each is in tests/families,
-# in folders of the family's name. Those whose code is on no package index want its source, too: OPENPI_SRC, OPENVLA_SRC,
+# Environments of model families: requirements/NAME.txt, in $(VENV)-NAME. What is tested in each is in the folders
+# families/NAME of tests/ and of the plug-ins' tests. Those whose code is on no package index want its source, too: OPENPI_SRC, OPENVLA_SRC,
 # OPENVLA_OFT_SRC, OCTO_SRC, DIFFUSION_POLICY_SRC, VJEPA2_SRC, GR00T_SRC.
 # ros is a ROS 2 of its own; it wants Python 3.11.
 # lerobot06 wants Python 3.12, and TORCH_CUDA=1 where no index has a torch without CUDA for it: several GB.
 # calvin wants CALVIN_SRC, a checkout.
 # robocasa is only tested where it is named: 1.3 GB, and a minute.
 FAMILIES ?= libero libero_pro lerobot hf rcs ros torchrl
+TESTS_OF = $(foreach family,$(1),$(wildcard tests/families/$(family) plugins/*/tests/families/$(family)))
 TESTED_IN_libero := libero robosuite
 TESTED_IN_hf := pi0 arro vjepa2_ac
 TESTED_IN_lerobot06 := lerobot gr00t
@@ -122,10 +126,10 @@ families: environments
 
 family-%: $(VENV)-%/.installed
 	@echo '== tests of $(or $(TESTED_IN_$*),$*), in $(VENV)-$*'
-	$(VENV)-$*/bin/python tests/support/play_again.py $(addprefix tests/families/,$(or $(TESTED_IN_$*),$*))
+	$(VENV)-$*/bin/python tests/support/play_again.py $(call TESTS_OF,$(or $(TESTED_IN_$*),$*))
 
 verified-%: $(VENV)-%/.installed
-	$(VENV)-$*/bin/python -m pytest -p no:cacheprovider -m verifies --verified $(addprefix tests/families/,$(or $(TESTED_IN_$*),$*))
+	$(VENV)-$*/bin/python -m pytest -p no:cacheprovider -m verifies --verified $(call TESTS_OF,$(or $(TESTED_IN_$*),$*))
 
 verified:
 	@$(MAKE) --no-print-directory $(addprefix verified-,$(filter-out libero libero_pro rcs ros torchrl,$(FAMILIES)))
@@ -148,6 +152,7 @@ programs: setup $(patsubst %,$(VENV)-%/.installed,$(filter lerobot%,$(FAMILIES))
 # Made once for each state of the family's requirements, of what a server installs and of what `env make` adds: not removed as a mere step.
 .PRECIOUS: $(VENV)-%/.installed
 $(VENV)-%/.installed: requirements/%.txt requirements/testing.txt $(wildcard requirements/*.cpu.txt) $(VENV)/server.txt \
+    $(PROJECTS) \
     vlagents_ray/policies/base/import_fixes.py
 	$(BIN)/vlagents-ray env make $< $(addprefix --with ,requirements/testing.txt $(wildcard requirements/$*.testing.txt)) \
 	  $(if $(TORCH_CUDA),--cuda) --out $(VENV)-$*
@@ -209,10 +214,11 @@ clean:
 	rm -rf build dist *.egg-info .pytest_cache .mypy_cache .ruff_cache .hypothesis .import_linter_cache
 	find vlagents_ray benchmarks plugins tests -type d -name __pycache__ -prune -exec rm -rf {} +
 
-# Installed once for each state of pyproject.toml, under the constraints of the torch that came first.
-$(STAMP): pyproject.toml $(CONSTRAINTS)
-	@echo '== installing vlagents-ray into $(VENV)'
-	$(PIP) install --quiet --constraint $(CONSTRAINTS) --editable '.[dev]'
+# Installed once for each state of all pyproject.toml, under the constraints of the torch that came first.
+$(STAMP): $(PROJECTS) $(CONSTRAINTS)
+	@echo '== installing vlagents-ray and its plug-ins $(PLUGINS) into $(VENV)'
+	$(PIP) install --quiet --constraint $(CONSTRAINTS) --editable '.[dev]' \
+	  $(foreach plugin,$(PLUGINS),--editable 'plugins/vlagents_ray_$(plugin)[dev]')
 	$(PIP) check
 	@touch $@
 
@@ -227,11 +233,12 @@ $(VENV)/server.txt: pyproject.toml | $(STAMP)
 	  print(*project["dependencies"], *project["optional-dependencies"]["serve"], sep="\n")' >$@.new
 	@cmp -s $@.new $@ && rm $@.new || mv $@.new $@
 
-$(VENV)-check/.installed: pyproject.toml
+$(VENV)-check/.installed: $(PROJECTS)
 	@$(if $(PYTHON),,$(error $(NO_PYTHON)))
 	'$(PYTHON)' -m venv $(VENV)-check
 	@echo '== installing what the quick tests want into $(VENV)-check'
-	$(VENV)-check/bin/python -m pip --disable-pip-version-check install --quiet --editable '.[check]'
+	$(VENV)-check/bin/python -m pip --disable-pip-version-check install --quiet --editable '.[check]' \
+	  $(foreach plugin,$(PLUGINS),--editable plugins/vlagents_ray_$(plugin))
 	@touch $@
 
 $(VENV)-docs/.installed: pyproject.toml

@@ -16,9 +16,7 @@ from readme_blocks import PAGES, commands, options_of, read_as_typed
 from tables import section
 
 from vlagents_ray.cli.evaluate import read_run
-from vlagents_ray.envs import aloha, calvin, metaworld, robocasa
 from vlagents_ray.envs.gymnasium import known
-from vlagents_ray.envs.robosuite import TASKS
 from vlagents_ray.envs.simulator import BenchmarkProtocol
 from vlagents_ray.errors import BY_CODE, Overloaded
 from vlagents_ray.evaluate import EvalConfig
@@ -26,6 +24,8 @@ from vlagents_ray.interface import Act
 from vlagents_ray.protocol import frame_layout, frames, json_messages, messages, values
 from vlagents_ray.protocol.messages import Limits, Reply
 from vlagents_ray.serve.config.deployment import EnvironmentArgs, ServerArgs
+from vlagents_ray_sims import aloha, calvin, metaworld, robocasa
+from vlagents_ray_sims.robosuite import TASKS
 
 ROOT = Path(__file__).parents[1]
 DOCS = ROOT / "docs"

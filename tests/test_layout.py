@@ -73,7 +73,11 @@ def test_a_plugin_asks_for_the_package_of_its_own_version() -> None:
     root = PACKAGE.parent
     ours = tomllib.loads((root / "pyproject.toml").read_text())["project"]["version"]
     found = [tomllib.loads(path.read_text())["project"] for path in sorted(root.glob("plugins/*/pyproject.toml"))]
-    assert [project["name"] for project in found] == ["lerobot_policy_vlagents", "vlagents_ray_arro"]
+    assert [project["name"] for project in found] == [
+        "lerobot_policy_vlagents",
+        "vlagents_ray_arro",
+        "vlagents-ray-sims",
+    ]
     assert {project["version"] for project in found} == {ours}
-    asked = [{one.replace("[serve]", "") for one in project["dependencies"]} for project in found]
+    asked = [{re.sub(r"\[.*\]", "", one) for one in project["dependencies"]} for project in found]
     assert all(f"vlagents-ray>={ours}" in one for one in asked)

@@ -9,6 +9,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+import tables
 import tomllib
 
 import vlagents_ray
@@ -89,8 +90,10 @@ def test_every_optional_package_has_a_cure() -> None:
 def test_the_extras_and_files_that_cures_name_exist() -> None:
     extras = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["optional-dependencies"]
     assert set(registry._EXTRAS.keys()) <= extras.keys()
-    adapters = (registry.POLICIES | registry.ENVS).values()
-    assert {one.extra for one in adapters if one.extra} <= extras.keys()
+    adapters = (registry.entries("policies") | registry.entries("envs")).values()
+    for entry in adapters:
+        project = tomllib.loads((ROOT / tables.folder_of(entry) / "pyproject.toml").read_text())["project"]
+        assert entry.extra is None or entry.extra in project["optional-dependencies"]
     assert {one.requirements[0] for one in registry.POLICIES.values() if one.requirements} == set(FAMILIES)
     for file in {file for one in adapters for file in one.requirements}:
         assert (ROOT / f"requirements/{file}.txt").exists()

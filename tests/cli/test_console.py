@@ -16,7 +16,7 @@ from vlagents_ray.cli import console, listing
 from vlagents_ray.cli.console import PlainConsole, table
 from vlagents_ray.cli.main import app, envs, policies
 from vlagents_ray.envs.tabletop import Tabletop
-from vlagents_ray.registry import POLICIES, WRAPPERS
+from vlagents_ray.registry import POLICIES, names
 
 CLI = Path(console.__file__).parent
 CURE = "pip install 'vlagents-ray[libero]' [/] \\[red] and /a/very/long/path/" + "of-an-interpreter/" * 8 + "bin/python"
@@ -88,7 +88,7 @@ def test_a_listing_is_as_wide_as_a_terminal_and_has_a_line_for_each_elsewhere(sh
     if console.out.is_terminal:
         assert max(map(len, rows)) <= 80
     else:
-        assert sorted(row.split()[0] for row in rows[1:]) == sorted([*POLICIES, *WRAPPERS])
+        assert sorted(row.split()[0] for row in rows[1:]) == sorted([*names("policies"), *names("wrappers")])
     assert "…" not in shown.getvalue()
 
 

@@ -18,7 +18,7 @@ from vlagents_ray.cli.doctor import Check
 from vlagents_ray.cli.main import app
 from vlagents_ray.envs.tabletop import Tabletop
 from vlagents_ray.evaluate import EvalConfig
-from vlagents_ray.registry import POLICIES, WRAPPERS
+from vlagents_ray.registry import names
 
 ARM = "import numpy as np\nfrom vlagents_ray import Obs\nclass Arm:\n    def observe(self): return Obs(gripper=50.0)\n"
 ARM += "    def apply(self, action): pass\n    def stop(self): pass\n"
@@ -54,7 +54,7 @@ def test_what_a_script_reads_is_json(tmp_path: Path, monkeypatch: pytest.MonkeyP
         assert (name, done.exit_code, done.stderr) == (name, int(name == "doctor"), "")
         said[name] = json.loads(done.stdout)
     found = {one["name"]: one for one in said["policies"]}
-    assert found.keys() == {*POLICIES, *WRAPPERS}
+    assert found.keys() == {*names("policies"), *names("wrappers")}
     assert (found["noop"]["kind"], found["noop"]["missing"]) == ("policy", None)
     assert found["noop"]["details"][0] == "action_dim=7"
     assert [one["name"] for one in said["envs"]] == ["tabletop"]

@@ -6,6 +6,7 @@ import logging
 import re
 import stat
 import threading
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -207,6 +208,6 @@ def test_a_policy_whose_weights_a_checkout_has_is_served_by_its_name(
     assert of_name == of_file | {"checkpoint": of_name["checkpoint"]}
     changed = read_deployment("reference", {"config": {"execute": 2}})
     assert own_settings(changed.applications[0]) == of_file | {"execute": 2}
-    monkeypatch.setattr(deployment_file, "POLICIES", {})
+    monkeypatch.setitem(POLICIES, "reference", replace(POLICIES["reference"], weights=False))
     with pytest.raises(ConfigError, match="is missing"):
         read_deployment("reference")

@@ -9,22 +9,15 @@ import sys
 from pathlib import Path
 
 import pytest
+from fake_gpus import TWO_GPUS, chosen, nothing_chosen
 
 from vlagents_ray.envs import graphics
 from vlagents_ray.envs.graphics import EGL_DEVICE, GPUS, EglDevice, Renderer, fitting, require_own, usable_devices
-from vlagents_ray.envs.robosuite import importing_robosuite
-from vlagents_ray.errors import ConfigError, EnvFailed
+from vlagents_ray.errors import ConfigError
 
 LLVMPIPE = Renderer("llvmpipe (LLVM 15.0.6, 256 bits)", software=True, cuda=None)
 NVIDIA = Renderer("NVIDIA H200/PCIe/SSE2", software=False, cuda=0)
 OTHERS = Renderer("NVIDIA H200/PCIe/SSE2", software=False, cuda=None)
-# EGL counts otherwise than CUDA, has a device that CUDA does not know, and Mesa's last.
-TWO_GPUS = [
-    EglDevice(0, software=False, cuda=1),
-    EglDevice(1, software=False, cuda=0),
-    EglDevice(2, software=False, cuda=None),
-    EglDevice(3, software=True, cuda=None),
-]
 SUMMARY = """GPU: NVIDIA H200
   Supported: 1
   Present:   0
@@ -38,18 +31,9 @@ GPU: llvmpipe (LLVM 15.0.6, 256 bits)
 """
 
 
-@pytest.fixture(autouse=True)
-def _nothing_chosen(monkeypatch: pytest.MonkeyPatch) -> None:
-    for name in (GPUS, EGL_DEVICE, "MUJOCO_GL", "DISPLAY", "LP_NUM_THREADS", *graphics.VULKAN_DRIVERS):
-        monkeypatch.setenv(name, "")  # so that what the test sets is undone
-        monkeypatch.delenv(name)
-    monkeypatch.setattr(graphics, "devices", lambda: TWO_GPUS)
+__all__ = ["nothing_chosen"]
 
-
-def chosen(monkeypatch: pytest.MonkeyPatch, visible: str) -> str | None:
-    monkeypatch.setenv(GPUS, visible)
-    graphics.choose_devices()
-    return os.environ.get(EGL_DEVICE)
+pytestmark = pytest.mark.usefixtures("nothing_chosen")
 
 
 @pytest.mark.parametrize(
@@ -134,22 +118,6 @@ def test_drawing_on_anything_but_what_was_given_is_an_error_with_its_cure(
 
 def test_sapiens_devices_are_read_from_its_summary() -> None:
     assert usable_devices(SUMMARY) == [("NVIDIA H200", 0), ("llvmpipe (LLVM 15.0.6, 256 bits)", None)]
-
-
-def test_robosuite_sees_the_number_that_egl_has_for_the_gpu_while_it_is_imported(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    chosen(monkeypatch, "7")
-    with importing_robosuite("libero"):
-        assert os.environ[GPUS] == os.environ[EGL_DEVICE] == "1"
-    assert os.environ[GPUS] == "7"
-
-
-def test_libero_without_a_gpu_and_without_software_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("MUJOCO_GL", "egl")
-    monkeypatch.setenv(GPUS, "")
-    with pytest.raises(EnvFailed, match="no EGL device that renders in software"), importing_robosuite("libero"):
-        pass
 
 
 DRAW = """

@@ -14,7 +14,7 @@ from vlagents_ray.contract import ActionSpec, Contract
 from vlagents_ray.envs.simulator import BenchmarkProtocol, SimulatorEnv
 from vlagents_ray.errors import ConfigError, EnvFailed, InvalidAction, NotReset
 from vlagents_ray.interface import Act, Obs
-from vlagents_ray.registry import ENVS
+from vlagents_ray.registry import entries
 from vlagents_ray.testing import require_wireable
 
 ANY_PROTOCOL = {"tabletop", "gymnasium"}  # our own example, and environments of others by their ids
@@ -52,9 +52,9 @@ def test_what_a_protocol_does_not_settle_cannot_deviate_from_it() -> None:
         PROTOCOL.describe(colour="red")
 
 
-@pytest.mark.parametrize("suite", sorted(set(ENVS) - ANY_PROTOCOL))
+@pytest.mark.parametrize("suite", sorted(set(entries("envs")) - ANY_PROTOCOL))
 def test_the_page_of_a_benchmark_states_its_protocol(suite: str) -> None:
-    name = ENVS[suite].page or suite
+    name = entries("envs")[suite].page or suite
     page = section("benchmarks", name.partition("#")[0])
     own = page if "\n## Protocol\n" in page else section("benchmarks", name)  # several benchmarks may share a page
     protocol = re.search(r"^##+ Protocol.*?\n(.*?)(?=^##|\Z)", own, re.DOTALL | re.MULTILINE)

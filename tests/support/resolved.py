@@ -29,8 +29,17 @@ FAMILIES = ROOT / "requirements"
 # A robot has its own ROS; RoboCasa wants 10 GB besides its packages, CALVIN a checkout; TorchRL learns beside a server.
 WITHOUT_IMAGE = {"testing", "ros", "robocasa", "calvin", "torchrl"}
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
-EXTRAS: dict[str, list[str]] = PROJECT["optional-dependencies"]
-OF_DEVELOPMENT = {"check", "docs", "dev"}  # these are for Python 3.11 alone
+_PLUGIN_FILES = sorted(ROOT.glob("plugins/vlagents_ray_*/pyproject.toml"))
+PLUGINS = [tomllib.loads(file.read_text())["project"] for file in _PLUGIN_FILES]
+OF_DEVELOPMENT = {"all", "check", "docs", "dev"}  # for Python 3.11 alone; "all" brings plug-ins
+# Extras of the plug-ins, with what their distribution needs. No two distributions have an extra of the same name.
+OF_PLUGINS: dict[str, list[str]] = {
+    extra: [*project["dependencies"], *requirements]
+    for project in PLUGINS
+    for extra, requirements in project.get("optional-dependencies", {}).items()
+    if extra not in OF_DEVELOPMENT
+}
+EXTRAS: dict[str, list[str]] = PROJECT["optional-dependencies"] | OF_PLUGINS
 PYTHONS = ("3.10", "3.11", "3.12", "3.13")
 SERVER_PYTHON = "3.11"  # of the images
 PLATFORM = "x86_64-manylinux_2_36"  # Debian bookworm's
@@ -153,7 +162,9 @@ def families() -> list[Path]:
 
 def locks() -> dict[str, tuple[str, list[str]]]:
     """Of each lock's name the Python and the requirements."""
-    servers = ["serve", "sim", *(extra for extra in EXTRAS if f"{PROJECT['name']}[sim]" in EXTRAS[extra])]
+    of_core = [extra for extra in EXTRAS if f"{PROJECT['name']}[sim]" in EXTRAS[extra]]
+    of_plugins = [extra for extra, wanted in OF_PLUGINS.items() if f"{PROJECT['name']}[maniskill]" not in wanted]
+    servers = dict.fromkeys(["serve", "sim", *of_core, *of_plugins])
     found = {f"server-{extra}": (SERVER_PYTHON, direct(extra)) for extra in servers}
     for file in families():
         python = re.match(r"# python: (\S+)", file.read_text())

@@ -40,10 +40,10 @@ def surface() -> str:
         "Errors: codes in answers, and their classes": error_codes(),
         "Registered names": registered(),
         "Deployment file: args": models_of("vlagents_ray.serve.config.deployment:ServerArgs"),
-        "Deployment file: args.config of each policy": settings_of("POLICIES"),
-        "Deployment file: args.dialects": settings_of("DIALECTS"),
+        "Deployment file: args.config of each policy": settings_of("policies"),
+        "Deployment file: args.dialects": settings_of("dialects"),
         "Evaluation file": models_of("vlagents_ray.evaluate.plan.config:EvalConfig"),
-        "Evaluation file: env_options of each environment": settings_of("ENVS"),
+        "Evaluation file: env_options of each environment": settings_of("envs"),
         "HTTP: paths of an application": paths(),
         "Prometheus: series and their own tags": series(),
         "Exported tables: columns": columns(),
@@ -113,14 +113,14 @@ def error_codes() -> Iterator[str]:
 
 def registered() -> Iterator[str]:
     registry = importlib.import_module("vlagents_ray.registry")
-    for kind in ("POLICIES", "WRAPPERS", "ENVS", "DIALECTS"):
-        yield f"{kind.lower()}: {', '.join(sorted(getattr(registry, kind)))}"
+    for kind in ("policies", "wrappers", "envs", "dialects"):
+        yield f"{kind}: {', '.join(sorted(registry.names(kind)))}"
 
 
 def settings_of(kind: str) -> Iterator[str]:
     registry = importlib.import_module("vlagents_ray.registry")
-    for name, one in sorted(getattr(registry, kind).items(), key=lambda named: named[0]):
-        cls = _class(getattr(one, "target", one))
+    for name, entry in sorted(registry.entries(kind).items(), key=lambda named: named[0]):
+        cls = _class(entry.target)
         config = getattr(cls, "Config", None)
         if config is None:
             yield f"{name}{_arguments(cls.__init__)}"

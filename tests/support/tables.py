@@ -11,23 +11,25 @@ import re
 from collections.abc import Iterable, Iterator
 from pathlib import Path
 
+import tomllib
 from programs import others, ran, settings
 from verified import RUN_WITH, marked, notes
 
 from vlagents_ray.evaluate.results.statistics import wilson
-from vlagents_ray.registry import ENVS, POLICIES, Adapter
+from vlagents_ray.registry import CORE, RegistryEntry, entries
 
 ROOT = Path(__file__).parents[2]
+PUBLISHED = ROOT / "vlagents_ray" / "published.json"
 RATES = json.loads((ROOT / "tests/rates.json").read_text())  # which the tests that it names find again
 LEARNT = json.loads((ROOT / "reference/checkpoint/rates.json").read_text())  # of the reference policy, by simulator
 WAYS = json.loads((ROOT / "reference/success.json").read_text())["ways"]  # of serving it, by `benchmarks.success`
 
 
-def _listed(adapters: dict[str, Adapter]) -> Iterator[tuple[str, Adapter]]:
+def _listed(adapters: dict[str, RegistryEntry]) -> Iterator[tuple[str, RegistryEntry]]:
     return ((name, one) for name, one in adapters.items() if one.about)
 
 
-def _link(name: str, text: str, one: Adapter, folder: str) -> str:
+def _link(name: str, text: str, one: RegistryEntry, folder: str) -> str:
     page = name if one.page is None else one.page
     file, at, anchor = page.partition("#")
     return f"[{text}]({folder}{file}.md{at}{anchor})" if page else text
@@ -37,7 +39,23 @@ def _code(words: Iterable[str]) -> str:
     return ", ".join(f"`{word}`" for word in words)
 
 
-def page_of(name: str, one: Adapter) -> str:
+def folder_of(entry: RegistryEntry) -> str:
+    """Return the folder that pip installs in a checkout, of the distribution that registers an entry."""
+    return "." if entry.distribution == CORE else f"plugins/{entry.distribution.replace('-', '_')}"
+
+
+def published() -> str:
+    """Return the text of published.json: the distribution of each name that this repository's plug-ins register."""
+    kinds: dict[str, dict[str, str]] = {}
+    for file in sorted(ROOT.glob("plugins/*/pyproject.toml")):
+        project = tomllib.loads(file.read_text())["project"]
+        for group, points in project.get("entry-points", {}).items():
+            kind = kinds.setdefault(group.removeprefix("vlagents_ray."), {})
+            kind.update(dict.fromkeys(points, project["name"]))
+    return json.dumps(kinds, indent=2, sort_keys=True) + "\n"
+
+
+def page_of(name: str, one: RegistryEntry) -> str:
     """Return the name of an adapter's page; empty if it has none."""
     return name if one.page is None else one.page.partition("#")[0]
 
@@ -82,7 +100,7 @@ def verified(name: str, family: str = "") -> str:
 def policies(folder: str = "") -> Iterator[str]:
     """Yield the rows of the policies; `folder` leads to docs/policies."""
     yield from ("| policy | models | source | verified |", "|---|---|---|---|")
-    for name, one in _listed(POLICIES):
+    for name, one in _listed(entries("policies")):
         source = f"a checkout, {_code(one.checkouts)}" if one.checkouts else "PyPI"
         said = verified(name, name if name in RUN_WITH else page_of(name, one))
         yield f"| {_link(name, f'`{name}`', one, folder)} | {one.about} | {one.wants or source} | {said} |"
@@ -100,8 +118,8 @@ def simulated(name: str) -> str:
 def environments(folder: str = "") -> Iterator[str]:
     """Yield the rows of the environments; `folder` leads to docs/benchmarks."""
     yield from ("| environment | tasks | needs | verified |", "|---|---|---|---|")
-    for name, one in _listed(ENVS):
-        packages = [f"`'.[{one.extra}]'`"] if one.extra else []
+    for name, one in _listed(entries("envs")):
+        packages = [f"`'{folder_of(one)}[{one.extra}]'`"] if one.extra else []
         packages += [f"`requirements/{file}.txt`" for file in one.requirements]
         wants = "; ".join(filter(None, (" or ".join(packages), one.wants)))
         yield f"| {_link(name, f'`{name}{one.tasks}`', one, folder)} | {one.about} | {wants} | {simulated(name)} |"
@@ -145,7 +163,7 @@ TABLES: dict[str, dict[str, list[str]]] = {
 def with_tables(file: str, text: str) -> str:
     """Return the text of a page with its tables, or that of mkdocs.yml with the pages of the adapters."""
     if file == "mkdocs.yml":
-        for folder, adapters in (("policies", POLICIES), ("benchmarks", ENVS)):
+        for folder, adapters in (("policies", entries("policies")), ("benchmarks", entries("envs"))):
             found = dict.fromkeys(page_of(name, one) for name, one in _listed(adapters))
             pages = "".join(f"          - {folder}/{page}.md\n" for page in found if page)
             index = f"          - {folder}/index.md\n"
@@ -164,6 +182,7 @@ def main() -> None:
     for file in (*TABLES, "mkdocs.yml"):
         path = ROOT / file
         path.write_text(with_tables(file, path.read_text()))
+    PUBLISHED.write_text(published())
 
 
 if __name__ == "__main__":

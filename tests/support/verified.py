@@ -22,10 +22,10 @@ from typing import Any
 
 import pytest
 
-from vlagents_ray.registry import POLICIES
+from vlagents_ray.registry import entries, find_entry
 
 ROOT = Path(__file__).parents[2]
-FAMILIES = ROOT / "tests" / "families"
+FOLDERS = ("tests/families", *(str(path.relative_to(ROOT)) for path in sorted(ROOT.glob("plugins/*/tests/families"))))
 PAGES = ROOT / "docs" / "policies"
 PYTHON = "3.11"  # of this project's own environment
 BEGIN, END = "<!-- verified: {} -->", "<!-- /verified -->"
@@ -40,9 +40,9 @@ PLUGINS = {"arro": "other#arro"}  # of packages in plugins/, with their place am
 # Of each family: the files in requirements/, and the packages and checkouts whose versions matter.
 RUN_WITH = {
     name: (" ".join(one.requirements), (*one.checkouts, *one.needs[bool(one.checkouts) :]))
-    for name, one in POLICIES.items()
+    for name, one in entries("policies").items()
     if one.requirements
-    if (FAMILIES / name).is_dir()
+    if any((ROOT / folder / name).is_dir() for folder in FOLDERS)
 } | {"arro": ("hf", ("transformers", "torch"))}
 
 
@@ -82,20 +82,26 @@ class VerifyingTests:
             noted_in(family).write_text(json.dumps(noted, indent=2) + "\n")
 
 
+def folder_of(family: str) -> Path:
+    """The folder of a family's tests, among those of the core or of a plug-in."""
+    folders = [ROOT / folder / family for folder in FOLDERS]
+    return next((folder for folder in folders if folder.is_dir()), folders[0])
+
+
 def noted_in(family: str) -> Path:
     """The file with the outcomes of a family's tests in this Python."""
     python = _python()
-    return FAMILIES / family / ("verified.json" if python == PYTHON else f"verified.python{python}.json")
+    return folder_of(family) / ("verified.json" if python == PYTHON else f"verified.python{python}.json")
 
 
 def notes(family: str) -> list[dict[str, Any]]:
     """What is noted of a family, for each Python in which it was tested."""
-    return [json.loads(file.read_text()) for file in sorted((FAMILIES / family).glob("verified*.json"))]
+    return [json.loads(file.read_text()) for file in sorted(folder_of(family).glob("verified*.json"))]
 
 
 def marked(family: str) -> Iterator[tuple[str, str]]:
     """Yield each test of a family that is marked `verifies`, as `file::test`, and what it verifies."""
-    for file in sorted((FAMILIES / family).glob("test_*.py")):
+    for file in sorted(folder_of(family).glob("test_*.py")):
         for node in ast.parse(file.read_text()).body:
             for mark in node.decorator_list if isinstance(node, ast.FunctionDef) else ():
                 if isinstance(mark, ast.Call) and ast.unparse(mark.func) == "pytest.mark.verifies":
@@ -119,7 +125,7 @@ def table(family: str) -> str:
         [
             f"`make verified FAMILIES={_quoted(requirements)}` runs these tests with small random checkpoints. {ran}",
             "",
-            f"| the policy … | `tests/families/{family}` | {' | '.join(cases)} |",
+            f"| the policy … | `{folder_of(family).relative_to(ROOT)}` | {' | '.join(cases)} |",
             f"|---|---{'|---' * len(cases)}|",
             *rows,
         ]
@@ -136,7 +142,7 @@ def with_table(page: str, family: str) -> str:
 
 def page_of(family: str) -> Path:
     """The page that has a family's table."""
-    one = POLICIES.get(family)
+    one = find_entry("policies", family)
     name = (one.page if one else PLUGINS[family]) or family
     return PAGES / f"{name.partition('#')[0]}.md"
 

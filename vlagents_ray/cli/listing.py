@@ -13,7 +13,16 @@ from itertools import groupby
 from typing import TYPE_CHECKING, Any
 
 from vlagents_ray.errors import MissingDependency, VLAgentsError
-from vlagents_ray.registry import POLICIES, env_class, names, policy_class, wrapper_class
+from vlagents_ray.registry import (
+    env_class,
+    find_entry,
+    names,
+    not_installed,
+    pip_install,
+    policy_class,
+    target_of,
+    wrapper_class,
+)
 
 if TYPE_CHECKING:
     from vlagents_ray.serve.launch.deployment_file import Deployment
@@ -40,14 +49,15 @@ class Listed:
 def policies_and_wrappers() -> Iterator[Listed]:
     """Yield the policies, then the wrappers."""
     for kind, registered, find in (("policy", "policies", policy_class), ("wrapper", "wrappers", wrapper_class)):
-        for name, target in sorted(names(registered).items()):
+        for name in sorted(names(registered)):
             try:
                 cls = find(name)
             except VLAgentsError as error:
                 yield Listed(kind, name, "its module is not here", str(error), [])
                 continue
-            what = (sys.modules[target.partition(":")[0]].__doc__ or "").strip().partition("\n")[0]
+            what = (sys.modules[target_of(registered, name).partition(":")[0]].__doc__ or "").strip().partition("\n")[0]
             yield Listed(kind, name, what, missing_packages(name), list(settings_of(cls)))
+        yield from _in_other_plugins(kind, registered)
 
 
 def environments() -> Iterator[Listed]:
@@ -64,6 +74,14 @@ def environments() -> Iterator[Listed]:
             f"{len(tasks)} task{'s' * (len(tasks) != 1)}: {', '.join(short)}" if tasks else "any task of the simulator"
         )
         yield Listed("environment", name, what, missing, shown)
+    yield from _in_other_plugins("environment", "envs")
+
+
+def _in_other_plugins(kind: str, registered: str) -> Iterator[Listed]:
+    """Yield the names in plug-ins of the project that are not installed."""
+    for name, distribution in sorted(not_installed(registered).items()):
+        cure = pip_install(distribution=distribution)
+        yield Listed(kind, name, f"in {distribution}", f"not installed: {cure}", [])
 
 
 def installing(listed: Sequence[Listed]) -> Iterator[str]:
@@ -94,9 +112,10 @@ def require_packages(config: Deployment) -> None:
 
 def missing_packages(name: str, *, checkout: bool = True) -> str | None:
     """Return the packages that a model family lacks in this environment, with the cure; None if it lacks none."""
-    one = POLICIES.get(name)
-    if one is not None and one.extra and not all(map(importlib.util.find_spec, one.needs)):
-        return f"not in this environment ({', '.join(one.needs)}): pip install 'vlagents-ray[{one.extra}]'"
+    entry = find_entry("policies", name)
+    if entry is not None and entry.extra and not all(map(importlib.util.find_spec, entry.needs)):
+        cure = pip_install(entry.extra, entry.distribution)
+        return f"not in this environment ({', '.join(entry.needs)}): {cure}"
     modules, sources, requirements = _lacking(name)
     if not modules and not (sources and checkout):
         return None
@@ -109,12 +128,13 @@ def missing_packages(name: str, *, checkout: bool = True) -> str | None:
 
 def _lacking(name: str) -> tuple[list[str], list[str], str]:
     """Return the modules and checkout variables that a family lacks, and its requirements file."""
-    if (one := POLICIES.get(name)) is None or not one.requirements:
+    entry = find_entry("policies", name)
+    if entry is None or not entry.requirements:
         return [], [], ""
-    given = any(os.environ.get(variable) for variable in one.checkouts)
-    lacking = [module for module in one.needs[given:] if importlib.util.find_spec(module) is None]
-    no_source = bool(one.checkouts) and not given and one.needs[0] in lacking
-    return lacking[no_source:], list(one.checkouts) if no_source else [], f"{one.requirements[0]}.txt"
+    has_checkout = any(os.environ.get(variable) for variable in entry.checkouts)
+    lacking = [module for module in entry.needs[has_checkout:] if importlib.util.find_spec(module) is None]
+    no_source = bool(entry.checkouts) and not has_checkout and entry.needs[0] in lacking
+    return lacking[no_source:], list(entry.checkouts) if no_source else [], f"{entry.requirements[0]}.txt"
 
 
 def settings_of(cls: type) -> Iterator[str]:

@@ -124,7 +124,7 @@ class TorchRLPolicy(Agent):
         from ray import cloudpickle
 
         file = Path(self._factory)
-        make: Any = cloudpickle.loads(file.read_bytes()) if file.is_file() else named_class(self._factory, {})
+        make: Any = cloudpickle.loads(file.read_bytes()) if file.is_file() else named_class(self._factory)
         self.policy = make().eval()
 
     def parameters(self) -> dict[str, Any]:

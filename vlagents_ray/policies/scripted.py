@@ -28,7 +28,7 @@ class Scripted(Agent):
 
     def __init__(self, config: ScriptedConfig | None = None) -> None:
         self.config = config or ScriptedConfig()
-        self._class = named_class(self.config.expert, {}) if self.config.expert else None
+        self._class = named_class(self.config.expert) if self.config.expert else None
         self._expert: Expert | None = None
 
     @property

@@ -9,7 +9,7 @@ from vlagents_ray.contract import Contract
 from vlagents_ray.errors import ConfigError, UnknownPolicy
 from vlagents_ray.interface import Act, Agent, Obs
 from vlagents_ray.policies.outcomes import of_good
-from vlagents_ray.registry import POLICIES, policy_class, wrapper_class
+from vlagents_ray.registry import find_entry, policy_class, wrapper_class
 from vlagents_ray.settings import wrong_settings
 
 
@@ -130,12 +130,15 @@ def _example_of(policy: str, kind: type[Agent], config: Mapping[str, Any]) -> st
     """Return the end of a message that names a file and a page with the settings that `config` lacks, if any."""
     fields = getattr(kind.Config, "model_fields", {})
     missing = any(field.is_required() and name not in config for name, field in fields.items())
-    if not missing or policy not in POLICIES:
+    entry = find_entry("policies", policy)
+    if not missing or entry is None:
         return ""
-    adapter = POLICIES[policy]
-    page, _, section = (policy if adapter.page is None else adapter.page).partition("#")
-    where = f"docs/policies/{page}.md" + (f"#{section}" if section else "")
-    return f". deployments/{adapter.deployment or policy}.yaml of a checkout has an example, and {where} explains it"
+    page = policy if entry.page is None else entry.page
+    if "://" in page:
+        return f". {page} explains it"
+    file, _, section = page.partition("#")
+    where = f"docs/policies/{file}.md" + (f"#{section}" if section else "")
+    return f". deployments/{entry.deployment or policy}.yaml of a checkout has an example, and {where} explains it"
 
 
 def unloaded_contract(agent: Agent) -> Contract | None:

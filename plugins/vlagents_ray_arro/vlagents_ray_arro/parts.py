@@ -17,6 +17,7 @@ from PIL import Image
 from pydantic import BaseModel, Field
 
 from vlagents_ray.errors import ConfigError
+from vlagents_ray.naming import did_you_mean
 from vlagents_ray.policies.base.accelerator import ensure_torchvision, torch_device, torch_dtype
 from vlagents_ray.policies.base.checkpoint import find_checkpoint, from_pretrained
 from vlagents_ray.policies.base.config import DType
@@ -107,7 +108,12 @@ def make_part(kind: str, entry: str | Mapping[str, Mapping[str, Any]]) -> Any:
     if len(named) != 1:
         raise ConfigError(f"{kind}: got {sorted(named)}, want one name with its settings")
     [(name, settings)] = named.items()
-    cls = named_class(name, PARTS[kind])
+    registered = PARTS[kind]
+    target = registered.get(name, name)
+    if ":" not in target:
+        cure = did_you_mean(name, registered)
+        raise ConfigError(f"{kind}: expected one of {sorted(registered)}, or 'module:Class', got {name!r}{cure}")
+    cls = named_class(target)
     try:
         return cls(cls.Config(**(settings or {})))
     except (TypeError, ValueError) as error:

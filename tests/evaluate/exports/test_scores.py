@@ -14,8 +14,7 @@ from eval_fakes import LINE
 from pydantic import ValidationError
 from recorded_results import record, runs
 
-from vlagents_ray.envs import aloha, calvin, gymnasium, maniskill, metaworld, simpler
-from vlagents_ray.envs.libero import LiberoProtocol
+from vlagents_ray.envs import gymnasium, maniskill
 from vlagents_ray.envs.simulator import BenchmarkProtocol
 from vlagents_ray.errors import ConfigError
 from vlagents_ray.evaluate import EvalConfig, Results
@@ -25,6 +24,8 @@ from vlagents_ray.evaluate.exports.scores import benchmark_of, scores
 from vlagents_ray.evaluate.plan.jobs import plan
 from vlagents_ray.evaluate.results.statistics import wilson
 from vlagents_ray.evaluate.results.store import Store
+from vlagents_ray_sims import aloha, calvin, metaworld, simpler
+from vlagents_ray_sims.libero import LiberoProtocol
 
 VERSIONS = {"vlagents-ray": "0.1.0", "code": {"folder": None, "vlagents_ray": {"commit": "c" * 40}}}
 FOUR = ("libero_spatial", "libero_object", "libero_goal", "libero_10")

@@ -292,7 +292,7 @@ def families() -> list[Any]:
     with_checkpoints = [
         name
         for name, one in POLICIES.items()
-        if "checkpoint" in getattr(named_class(one.target, {}).Config, "model_fields", ())
+        if "checkpoint" in getattr(named_class(one.target).Config, "model_fields", ())
     ]
     return [pytest.param(name, marks=pytest.mark.torch if name == "vjepa2_ac" else ()) for name in with_checkpoints]
 
@@ -316,7 +316,7 @@ def test_a_family_asks_for_the_commit(
 ) -> None:
     for function in BEFORE.get(family, ()):
         monkeypatch.setattr(function, lambda *_args, **_options: None)
-    cls = named_class(POLICIES[family].target, {})
+    cls = named_class(POLICIES[family].target)
     fields = cls.Config.model_fields
     settings = {name: "any" for name, field in fields.items() if field.is_required()} | {"checkpoint": NAMED}
     policy = cls.from_config(settings | ({"trust_checkpoint": True} if "trust_checkpoint" in fields else {}))

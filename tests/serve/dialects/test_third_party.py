@@ -37,7 +37,10 @@ def entry_point(package: Path) -> str:
     info = package / f"{PACKAGE}-1.dist-info"
     info.mkdir()
     (info / "METADATA").write_text(f"Metadata-Version: 2.1\nName: {PACKAGE}\nVersion: 1\n")
-    (info / "entry_points.txt").write_text(f"[vlagents_ray.dialects]\nplain = {CLASS}\n")
+    (package / f"{PACKAGE}_registry.py").write_text(
+        f"from vlagents_ray.registry import RegistryEntry\nPLAIN = RegistryEntry({CLASS!r})\n"
+    )
+    (info / "entry_points.txt").write_text(f"[vlagents_ray.dialects]\nplain = {PACKAGE}_registry:PLAIN\n")
     return "plain"
 
 

@@ -18,7 +18,7 @@ from typing import Any
 from vlagents_ray.errors import ConfigError, StorageFailed
 from vlagents_ray.evaluate.episode.records import EpisodeResult
 from vlagents_ray.ray_tools.git_state import GitState, code_in, code_of
-from vlagents_ray.registry import names
+from vlagents_ray.registry import target_of
 
 VIDEOS, TRAJECTORIES, PROVENANCE = "videos", "trajectories", "provenance"
 _RESUME = "what was recorded is kept: go on with --resume"
@@ -178,7 +178,7 @@ def versions() -> dict[str, Any]:
 def policy_code(metadata: dict[str, Any]) -> GitState | None:
     """Return the git state of a policy's code, diff included, if it is the same here as on its server; else None."""
     policy = metadata.get("policy")
-    here = code_of(names("policies").get(policy, policy)) if isinstance(policy, str) else None
+    here = code_of(target_of("policies", policy)) if isinstance(policy, str) else None
     return here if here is not None and here.to_json() == metadata.get("code") else None
 
 

@@ -40,7 +40,7 @@ def expert_class(env_name: str) -> type[Expert]:
             f"no scripted expert for env {env_name!r}: there are experts for {sorted(EXPERTS)}; choose one of these "
             f"envs, set `expert` to one of examples/experts, 'experts.pusht:PushTExpert', or choose another policy"
         )
-    return named_class(target, {})
+    return named_class(target)
 
 
 def sim_vector(obs: Obs, size: int, env_name: str, cure: str = "this expert cannot act on images") -> np.ndarray:

@@ -16,7 +16,7 @@ from vlagents_ray.policies.base.program import Program, loaded_code
 from vlagents_ray.protocol.messages import DEFAULT_LIMITS, Limits
 from vlagents_ray.ray_tools.git_state import GitState, code_of
 from vlagents_ray.ray_tools.runtime_env import require_no_secrets
-from vlagents_ray.registry import names
+from vlagents_ray.registry import target_of
 from vlagents_ray.serve.access.api_keys import Keys, load_keys
 from vlagents_ray.serve.config.dialects import DialectArgs
 from vlagents_ray.serve.models.checkpoints import Checkpoints
@@ -377,9 +377,9 @@ class ServerArgs(_DeploymentModel):
 
     def code(self) -> tuple[GitState | None, Program]:
         """Return the git state of the policy's code, and the digests of its files and of those of its wrappers."""
-        policy = names("policies").get(self.policy, self.policy)
+        policy = target_of("policies", self.policy)
         wrappers = [name for one in self.wrappers for name in ([one] if isinstance(one, str) else one)]
-        classes = [policy, *(names("wrappers").get(name, name) for name in wrappers)]
+        classes = [policy, *(target_of("wrappers", name) for name in wrappers)]
         return code_of(policy), {name: of for one in classes for name, of in loaded_code(one).items()}
 
     @model_validator(mode="after")

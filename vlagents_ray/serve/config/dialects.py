@@ -17,7 +17,7 @@ from pydantic.fields import FieldInfo
 from vlagents_ray.contract import Contract
 from vlagents_ray.errors import ConfigError
 from vlagents_ray.protocol.messages import RankName
-from vlagents_ray.registry import DIALECTS, dialect_class, names, require
+from vlagents_ray.registry import dialect_class, names, require
 from vlagents_ray.wire import presets as wire_presets
 from vlagents_ray.wire.mapping import KeyMapping
 
@@ -77,7 +77,9 @@ class DialectArgs(BaseModel, extra="allow"):
         fields: dict[str, Any] = {str(name): (_config_of(str(name)) | None, None) for name in data}
         read = create_model("_Dialects", **fields).model_validate(data)
         found = {name: getattr(read, name) for name in fields}
-        return {name: found[name] for name in (*DIALECTS, *found) if found.get(name) is not None}
+        return {
+            name: found[name] for name in dict.fromkeys((*names("dialects"), *found)) if found.get(name) is not None
+        }
 
     @model_validator(mode="after")
     def _ports_of_their_own(self) -> DialectArgs:
@@ -177,5 +179,5 @@ def _preset(name: str) -> Mapping[str, Any]:
 
 def _stated() -> Iterator[Mapping[str, Mapping[str, Any]]]:
     """Yield the presets of each dialect, those of this package first, so that no plugin is imported to find them."""
-    yield from (dialect_class(name).presets for name in DIALECTS)
-    yield from (dialect_class(name).presets for name in names("dialects") if name not in DIALECTS)
+    for name in names("dialects"):
+        yield dialect_class(name).presets

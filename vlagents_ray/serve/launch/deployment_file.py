@@ -16,7 +16,7 @@ from vlagents_ray.naming import did_you_mean
 from vlagents_ray.policies.base.checkpoint import STEP as STEP_PLACE
 from vlagents_ray.policies.wrapper import build_agent, unloaded_contract
 from vlagents_ray.ray_tools.runtime_env import require_no_secrets
-from vlagents_ray.registry import POLICIES, names, policy_class
+from vlagents_ray.registry import find_entry, policy_class
 from vlagents_ray.serve.config.deployment import POLICY, ServerArgs
 from vlagents_ray.serve.models.checkpoints import CHOICE, STEP, Checkpoints
 from vlagents_ray.serve.ports import LOOPBACK
@@ -99,7 +99,8 @@ def read_deployment(
         if overrides:
             raise ConfigError(f"{source!r} holds the settings; edit it instead of giving {sorted(overrides)}")
         return _checked(read_yaml(path), source, step_follows)
-    if ":" not in source and source not in names("policies"):
+    entry = find_entry("policies", source)
+    if ":" not in source and entry is None:
         if "/" in source:
             raise UnknownPolicy(
                 f"policy: got {source!r}, want a policy or a deployment file; for a checkpoint, give the file of its "
@@ -107,7 +108,7 @@ def read_deployment(
             )
         policy_class(source)  # raises an error with the list of choices
     args = dict(overrides or {})
-    if source in POLICIES and POLICIES[source].weights and "checkpoint" not in args.get("config", {}):
+    if entry is not None and entry.weights and "checkpoint" not in args.get("config", {}):
         args["config"] = _settings_of_checkout(source) | args.get("config", {})
     return deployment(source, step_follows=step_follows, **args)
 

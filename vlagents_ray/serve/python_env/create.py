@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib.metadata
 import importlib.util
+import json
 import os
 import platform
 import re
@@ -14,11 +15,14 @@ import tempfile
 import zipfile
 from collections.abc import Callable, Sequence
 from pathlib import Path
+from urllib.parse import urlparse
+from urllib.request import url2pathname
 
 import vlagents_ray
 from vlagents_ray.errors import ConfigError, MissingDependency
 from vlagents_ray.policies.base import import_fixes
 from vlagents_ray.policies.base.accelerator import OLDEST_DRIVERS, driver_version
+from vlagents_ray.registry import plugin_distributions
 
 Progress = Callable[[str], None]
 
@@ -102,7 +106,7 @@ def make_environment(
     cuda: bool = False,
     progress: Progress = lambda _: None,
 ) -> Path:
-    """Create an environment for a policy, with this package in it.
+    """Create an environment for a policy, with this package and the installed plug-ins in it.
 
     On a machine without an NVIDIA GPU it gets the version of torch of this environment, and the replacements for other
     requirements in `NAME.cpu.txt`, in the folder of `requirements`. Where the GPU's driver is too old for CUDA 13, it
@@ -147,6 +151,9 @@ def make_environment(
                 require_no_cuda(made, asked)
         progress(f"installing {_US} {importlib.metadata.version(_US)} and {requirements}")
         install(made, asked)
+        plugins = _plugins(Path(scratch))
+        if plugins:
+            install(made, ["--no-deps", *plugins])
     _install_import_fixes(made)
     return made
 
@@ -168,19 +175,46 @@ def _ourselves(light: bool, scratch: Path) -> list[str]:
     return [*us, *(one.partition(";")[0].strip() for one in needed if one.startswith("pydantic"))]
 
 
-def installed_wheel(folder: Path) -> Path:
-    """Write a wheel of this package, from the installed files, into `folder`, and return its path.
+def _plugins(scratch: Path) -> list[str]:
+    """Return uv's arguments for the plug-ins as they are installed here.
+
+    They are installed without their dependencies: those of a model or a simulator are in the requirements.
+    """
+    arguments = []
+    for distribution in plugin_distributions():
+        source = _editable_source(importlib.metadata.distribution(distribution))
+        if source is not None:
+            arguments += ["--editable", str(source)]
+        else:
+            arguments.append(str(installed_wheel(scratch, distribution)))
+    return arguments
+
+
+def _editable_source(installed: importlib.metadata.Distribution) -> Path | None:
+    """Return the folder of a distribution that is installed as editable; None for any other.
+
+    See https://packaging.python.org/en/latest/specifications/direct-url.
+    """
+    text = installed.read_text("direct_url.json")
+    origin = json.loads(text) if text else {}
+    if not origin.get("dir_info", {}).get("editable"):
+        return None
+    return Path(url2pathname(urlparse(origin["url"]).path))
+
+
+def installed_wheel(folder: Path, distribution: str = _US) -> Path:
+    """Write a wheel of a distribution, from its installed files, into `folder`, and return its path.
 
     The wheel contains the files and a list of them, see
     https://packaging.python.org/en/latest/specifications/binary-distribution-format.
     """
-    here = importlib.metadata.distribution(_US)
+    here = importlib.metadata.distribution(distribution)
     kept = [
         file
         for file in here.files or ()
         if ".." not in file.parts and "__pycache__" not in file.parts and file.name not in _NOT_IN_A_WHEEL
     ]
-    made = folder / f"{_US.replace('-', '_')}-{here.version}-py3-none-any.whl"
+    made = folder / f"{distribution.replace('-', '_')}-{here.version}-py3-none-any.whl"
     record = next(str(file.parent / "RECORD") for file in kept if file.name == "METADATA")
     with zipfile.ZipFile(made, "w", zipfile.ZIP_DEFLATED) as wheel:
         for file in kept:

@@ -1,0 +1,5 @@
+"""What this distribution registers."""
+
+from vlagents_ray.registry import RegistryEntry
+
+ARRO = RegistryEntry("vlagents_ray_arro:Arro", page="other#arro")

@@ -1,0 +1,43 @@
+"""CALVIN as it is known without its simulator: scenes, contract, hash, and what a wrong checkout is told."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from vlagents_ray.contract import CameraSpec
+from vlagents_ray.envs.base import known_contract, make_env
+from vlagents_ray.errors import ConfigError, UnknownEnv
+from vlagents_ray_sims.calvin import PROTOCOL, Calvin, fnv1_32
+
+
+def test_the_contract_and_the_protocol_are_known_before_the_simulator_is_made() -> None:
+    known = known_contract("calvin/D", {})
+    assert known is not None
+    assert known.cameras == {"static": CameraSpec(200, 200), "gripper": CameraSpec(84, 84)}
+    assert {name: spec.dim for name, spec in (known.state or {}).items()} == {
+        "tcp_pos": 3,
+        "tcp_orn": 3,
+        "gripper_opening_width": 1,
+        "robot_joints": 7,
+    }
+    assert (known.action.dim, known.action.gripper_open, known.control_hz) == (7, 1.0, 30.0)
+    assert (Calvin.init_states, PROTOCOL.max_steps, PROTOCOL.episodes) == (1000, 1800, 1000)
+
+
+def test_the_hash_that_places_the_blocks_is_pyhashs() -> None:
+    """FNV-1 from 0, not from its usual basis: pyhash's own documentation has this number."""
+    assert fnv1_32("hello world") == 2805756500
+
+
+def test_wrong_settings_are_told_with_the_cure(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.delenv("CALVIN_SRC", raising=False)
+    with pytest.raises(UnknownEnv, match=r"calvin has no task 'E': want one of \['A', 'B', 'C', 'D'\]"):
+        make_env("calvin/E")
+    with pytest.raises(ConfigError, match="renderer is 'vulkan', want egl or tiny"):
+        make_env("calvin/D", renderer="vulkan")
+    with pytest.raises(ConfigError, match="CALVIN_SRC is not set; git clone --recurse-submodules"):
+        make_env("calvin/D")
+    with pytest.raises(ConfigError, match=r"lacks \['calvin_env/conf', .*want a checkout .* with its submodules"):
+        make_env("calvin/D", source_dir=str(tmp_path))

@@ -1,0 +1,126 @@
+"""Plug-ins: what a distribution registers, and what is said of one that is broken or not installed."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from vlagents_ray import registry
+from vlagents_ray.cli.listing import policies_and_wrappers
+from vlagents_ray.errors import ConfigError, UnknownEnv, UnknownPolicy
+from vlagents_ray.registry import entries, find_entry, names, not_installed, plugin_distributions
+
+Install = Callable[..., None]
+
+POLICY = """
+\"\"\"A policy of a plug-in.\"\"\"
+from vlagents_ray.policies.noop import Noop
+
+class Mine(Noop):
+    pass
+"""
+REGISTRY = """
+from vlagents_ray.registry import RegistryEntry
+
+MINE = RegistryEntry("lab_policies.mine:Mine", "models of the lab", page="https://example.org/mine")
+NO_ENTRY = "lab_policies.mine:Mine"
+"""
+
+
+@pytest.fixture
+def install(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Install:
+    """Install a distribution whose entry points are given by group; its package is `lab_policies`."""
+    package = tmp_path / "lab_policies"
+    package.mkdir()
+    (package / "__init__.py").write_text("")
+    (package / "mine.py").write_text(POLICY.replace('\\"', '"'))
+    (package / "registry.py").write_text(REGISTRY)
+    (package / "broken.py").write_text("import no_such_package\n")
+
+    def write(distribution: str, **groups: str) -> None:
+        info = tmp_path / f"{distribution.replace('-', '_')}-1.dist-info"
+        info.mkdir()
+        (info / "METADATA").write_text(f"Metadata-Version: 2.1\nName: {distribution}\nVersion: 1\n")
+        lines = [f"[vlagents_ray.{group}]\n{line}\n" for group, line in groups.items()]
+        (info / "entry_points.txt").write_text("".join(lines))
+        registry._installed_entry_points.cache_clear()
+
+    monkeypatch.syspath_prepend(tmp_path)
+    yield write
+    registry._installed_entry_points.cache_clear()
+
+
+def test_a_plugins_entry_carries_what_a_built_in_one_does(install: Install) -> None:
+    install("lab-policies", policies="mine = lab_policies.registry:MINE")
+    entry = find_entry("policies", "mine")
+    assert entry is not None
+    assert (entry.about, entry.page, entry.distribution) == (
+        "models of the lab",
+        "https://example.org/mine",
+        "lab-policies",
+    )
+    assert "mine" in names("policies")
+    assert "lab-policies" in plugin_distributions()
+    [listed] = [row for row in policies_and_wrappers() if row.name == "mine"]
+    assert (listed.kind, listed.what, listed.missing) == ("policy", "A policy of a plug-in.", None)
+
+
+def test_a_built_in_name_is_not_replaced(install: Install) -> None:
+    install("lab-policies", policies="noop = lab_policies.registry:MINE")
+    entry = find_entry("policies", "noop")
+    assert entry is not None
+    assert entry.distribution == registry.CORE
+
+
+@pytest.mark.parametrize(
+    ("value", "message"),
+    [
+        (
+            "lab_policies.registry:NO_ENTRY",
+            r"expected 'mine' of lab-policies to name a RegistryEntry.* a str; write",
+        ),
+        ("lab_policies.mine:Mine", r"got lab_policies.mine:Mine, a type; write"),
+        ("lab_policies.registry:GONE", r"importing lab_policies.registry:GONE failed"),
+        ("lab_policies.broken:MINE", r"importing .* failed: No module named 'no_such_package'; update that package"),
+    ],
+)
+def test_a_plugin_that_cannot_be_loaded_is_named_and_hides_no_other(
+    install: Install, value: str, message: str, caplog: pytest.LogCaptureFixture
+) -> None:
+    install("lab-policies", policies=f"mine = {value}")
+    with pytest.raises(ConfigError, match=message):
+        registry.policy_class("mine")
+    assert "noop" in entries("policies")
+    assert "mine" not in entries("policies")
+    assert "lab-policies" in caplog.text
+    [listed] = [row for row in policies_and_wrappers() if row.name == "mine"]
+    assert listed.missing is not None
+    assert "lab-policies" in listed.missing
+
+
+def test_a_name_of_two_distributions_is_an_error_that_names_both(install: Install) -> None:
+    install("lab-policies", policies="mine = lab_policies.registry:MINE")
+    install("other-lab", policies="mine = lab_policies.registry:OTHER")
+    with pytest.raises(ConfigError, match=r"registered .* by lab-policies and other-lab: uninstall one of them"):
+        registry.policy_class("mine")
+
+
+def test_a_name_of_a_plugin_that_is_not_installed_is_an_error_that_names_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    published = {"envs": {"shelf": "vlagents-ray-shelf"}, "policies": {"pi9": "vlagents-ray-models"}}
+    monkeypatch.setattr(registry, "published", lambda: published)
+    with pytest.raises(UnknownEnv, match="'shelf' is in vlagents-ray-shelf, which is not installed: pip install"):
+        registry.env_class("shelf/top")
+    with pytest.raises(UnknownPolicy, match="policy 'pi9' is in vlagents-ray-models"):
+        registry.policy_class("pi9")
+    [listed] = [row for row in policies_and_wrappers() if row.name == "pi9"]
+    assert listed.what == "in vlagents-ray-models"
+    assert listed.missing == "not installed: pip install vlagents-ray-models"
+
+
+def test_all_plugins_of_this_repository_are_installed_for_its_tests() -> None:
+    for kind in ("policies", "wrappers", "envs", "dialects"):
+        assert not_installed(kind) == {}, "make setup"
+        for name in names(kind):
+            assert find_entry(kind, name) is not None
