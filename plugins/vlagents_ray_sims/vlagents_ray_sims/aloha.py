@@ -56,7 +56,7 @@ class Aloha(SimulatorEnv):
 
     suite, title, known = "aloha", "gym-aloha", tuple(_TASKS)
     packages, distributions = ("gym_aloha", "dm_control", "mujoco"), ("gym-aloha", "dm-control", "mujoco")
-    cure = "pip install 'vlagents-ray[aloha]'"
+    cure = "pip install 'vlagents-ray-sims[aloha]'"
     _protocol = PROTOCOL
 
     def __init__(

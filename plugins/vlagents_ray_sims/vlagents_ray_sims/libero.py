@@ -224,7 +224,7 @@ class Libero(SimulatorEnv):
 
     suite, title = "libero", "LIBERO"
     packages, distributions = ("libero", "robosuite", "mujoco"), ("robosuite", "mujoco")
-    cure = "pip install 'vlagents-ray[libero]'"
+    cure = "pip install 'vlagents-ray-sims[libero]'"
     suites: ClassVar[Mapping[str, Suite]] = SUITES
 
     def __init__(
@@ -464,7 +464,7 @@ def package_folder() -> Path:
     require("libero")
     spec = importlib.util.find_spec("libero.libero")
     if spec is None or spec.origin is None:
-        raise MissingDependency("'libero' is another package; pip install 'vlagents-ray[libero]' brings hf-libero")
+        raise MissingDependency("'libero' is another package; pip install 'vlagents-ray-sims[libero]' brings hf-libero")
     return Path(spec.origin).parent
 
 

@@ -52,7 +52,7 @@ class MetaWorld(SimulatorEnv):
 
     suite, title = "metaworld", "Meta-World"
     packages, distributions = ("metaworld", "mujoco"), ("metaworld", "mujoco")
-    cure = "pip install 'vlagents-ray[metaworld]'"
+    cure = "pip install 'vlagents-ray-sims[metaworld]'"
     _protocol = PROTOCOL
 
     def __init__(
