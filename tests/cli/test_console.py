@@ -19,7 +19,7 @@ from vlagents_ray.envs.tabletop import Tabletop
 from vlagents_ray.registry import POLICIES, names
 
 CLI = Path(console.__file__).parent
-CURE = "pip install 'vlagents-ray-sims[libero]' [/] \\[red] and /a/very/long/path/" + "of-an-interpreter/" * 8 + "bin/python"
+CURE = "pip install 'vlagents-ray[libero]' [/] \\[red] and /a/very/long/path/" + "of-an-interpreter/" * 8 + "bin/python"
 
 
 @pytest.fixture(params=[True, False], ids=["terminal", "pipe"])
