@@ -76,6 +76,10 @@ class PushOptions:
             raise InvalidInput(f"mode: got {self.mode!r}, want one of {list(get_args(PushMode))}")
 
 
+class VersionNotHeld(UnknownSession):
+    """Raised if a session acts with a version of the weights that the replica does not hold."""
+
+
 class WeightsVersion:
     """One version of a model's weights."""
 
@@ -172,15 +176,35 @@ class ModelWeights:
         A session that `follows` the newest version gets a newer one that was pushed since with the mode "keep".
 
         Raises:
-            UnknownSession: The version is not held here.
+            VersionNotHeld: The version is not held here; see `restore`.
         """
         with self._lock:
             if follows and number < self.kept:
                 return self._alive.get(self.kept, self.newest)
             version = self._alive.get(number)
         if version is None or version.fingerprint != digest or version is self._staged:
-            raise UnknownSession(f"version {number} of the weights ({digest}) is not held here; reset the session")
+            raise VersionNotHeld(f"version {number} of the weights ({digest}) is not held here; reset the session")
         return version
+
+    def restore(self, number: int, digest: str, values: Mapping[str, Any]) -> WeightsVersion:
+        """Hold a version again that was freed here, or never pushed to this replica, as long as a session uses it.
+
+        Args:
+            number: Number of the version.
+            digest: Its fingerprint.
+            values: Its values, as another replica's `portable_values` returns them.
+
+        Raises:
+            VersionNotHeld: The values have another fingerprint.
+        """
+        restored = self.make(number, self.newest, values, PushOptions(allow_same=True))
+        if restored.fingerprint != digest:
+            raise VersionNotHeld(
+                f"version {number} of the weights: got values with fingerprint {restored.fingerprint}, want {digest}; "
+                f"reset the session"
+            )
+        with self._lock:
+            return self._alive.setdefault(number, restored)
 
     def catch_up(self, session: FollowingSession) -> None:
         """Change a session that was not in the table of sessions to the last version pushed with the mode "keep"."""

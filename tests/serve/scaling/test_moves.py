@@ -6,12 +6,13 @@ After each answer, every session is at one replica, in the state and with the we
 from __future__ import annotations
 
 import asyncio
+import gc
 import itertools
 import queue
 import threading
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
-from functools import partial
+from functools import partial, wraps
 from typing import Any
 
 import numpy as np
@@ -29,6 +30,7 @@ from vlagents_ray.interface import Agent, Obs
 from vlagents_ray.protocol.messages import Reply, Request
 from vlagents_ray.serve.access.api_keys import Caller, NoKey
 from vlagents_ray.serve.engine.sender import Sender
+from vlagents_ray.serve.scaling.session_migration import HeldSessions
 from vlagents_ray.serve.scaling.weight_push import ThisReplica, WeightPusher, WeightsReplica
 from vlagents_ray.serve.weights import PushMode, PushOptions, Rest
 
@@ -92,8 +94,6 @@ class Moves(RuleBasedStateMachine):
     @rule(name=st.sampled_from(_NAMES), at=st.sampled_from([0, 1]), steps=st.booleans())
     def act(self, name: str, at: int, steps: bool) -> None:
         session = self.open.get(name)
-        if session is not None and not self._can_move(session):
-            at = self._place(name) or 0
         reply = ask(self.served, at, "act", self.names[name], step=session.step if session and steps else None)
         if session is None:
             assert isinstance(reply.error, UnknownSession)
@@ -118,7 +118,7 @@ class Moves(RuleBasedStateMachine):
     def offer(self, name: str) -> None:
         """The session's replica gives it away, as when it stops."""
         at = self._place(name)
-        if at is None or not self._can_move(self.open[name]):
+        if at is None:
             return
         held, other = self.served.migrators[at].held, _Peer(self.served, 1 - at)
         given = held.send_to_peer(self.names[name], [other])
@@ -178,10 +178,6 @@ class Moves(RuleBasedStateMachine):
         for name in list(self.open):
             self.end(name)
 
-    def _can_move(self, session: _Session) -> bool:
-        """Whether both replicas hold the session's weights: others are freed where no session acts with them."""
-        return session.version in (self.newest, self.pinned)
-
     def _place(self, name: str) -> int | None:
         places = [at for at, engine in enumerate(self.served.engines) if self.names[name] in engine.sessions]
         assert len(places) <= 1
@@ -221,6 +217,46 @@ def test_a_session_that_moves_acts_with_the_weights_that_were_pushed_before(serv
         assert ask(served, 1, "close", name).error is None
     assert reply.error is None
     assert reply.act.info["policy"]["version"] == reply.act.action[0] == number
+
+
+@pytest.mark.parametrize("stops", [False, True])
+def test_sessions_move_with_weights_that_no_other_session_uses(
+    served: Replicas, stops: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The other replica has freed them. It gets them once for all sessions, and frees them with the last session."""
+    fetched: list[str] = []
+    weights = HeldSessions.weights
+
+    @wraps(weights)
+    async def counted(held: HeldSessions, session_id: str) -> dict[str, Any] | None:
+        fetched.append(session_id)
+        return await weights(held, session_id)
+
+    monkeypatch.setattr(HeldSessions, "weights", counted)
+    kwargs, names = {"weights": "follow"}, [f"moving {number}" for number in range(4)]
+    first = max(engine.weights.number for engine in served.engines) + 1
+    for number in (first, first + 1, first + 2):
+        for engine in served.engines:
+            engine.weights.stage(number, gains(float(number)), PushOptions())
+            engine.weights.commit(number, PushOptions())
+        if number == first:
+            assert all(ask(served, 0, "reset", name, kwargs=kwargs).error is None for name in names)
+    alive = served.engines[1].models.own_weights._alive
+    assert first not in alive
+    if stops:
+        held, other = served.migrators[0].held, _Peer(served, 1)
+        for name in names:
+            asyncio.run_coroutine_threadsafe(held.send_to_peer(name, [other]), served._loop).result(30)
+    for reply in [answer.get(timeout=30) for answer in [begin(served, 1, "act", name) for name in names]]:
+        assert reply.error is None
+        assert reply.act.info["policy"]["version"] == reply.act.action[0] == first
+    assert len(fetched) == 1
+    for name in names:
+        assert ask(served, 1, "close", name).error is None
+    for op in ("reset", "act", "close"):  # the policy acts with other weights
+        assert ask(served, 1, op, "beside", kwargs=kwargs if op == "reset" else {}).error is None
+    gc.collect()
+    assert first not in alive
 
 
 def test_no_key_has_more_sessions_at_a_replica_than_it_may_whatever_moves_there() -> None:

@@ -9,7 +9,7 @@ from __future__ import annotations
 import logging
 import threading
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor, wait
 from contextlib import suppress
 from functools import partial
@@ -704,11 +704,12 @@ class Engine:
         timeout_s: float = 0.0,
         began: float = 0.0,
         origin: Origin = NOWHERE,
+        weights: Mapping[str, Any] | None = None,
     ) -> Session[LoadedModel]:
         """Create a copy of the session that cannot act before `enter`; if it is not needed, call `abandon`.
 
         Its episode `began` at that time, s, of this engine's clock, or later. From now on it counts for the key of the
-        `origin`.
+        `origin`. `weights` are the values of its version of the weights, if that is not held here.
         """
         self.require_ready()
         self.sessions.require_room(session_id)
@@ -728,9 +729,12 @@ class Engine:
             model = self.models.adopt(arriving, CheckpointChoice(*state["choice"]), state["settings"], timeout_s)
             if tuple(state["version"]) != model.version:
                 raise UnknownSession(f"session {session_id!r}: of another version of the policy; reset it")
+            number, fingerprint = state["parameters"]
+            if weights is not None:  # the session holds the version until `find` returns it, or a newer one
+                arriving.weights = model.parameters.restore(number, fingerprint, weights)
+            arriving.weights = model.parameters.find(number, fingerprint, follows=state["follows"])
             with model.busy, model.uncaptured, model.call("adopt", threading.get_ident()):
                 arriving.agent = model.copies.load(state["agent"])
-            arriving.weights = model.parameters.find(*state["parameters"], follows=state["follows"])
             arriving.follows, arriving.instruction = state["follows"], state["instruction"]
         except BaseException:
             self.abandon(arriving)

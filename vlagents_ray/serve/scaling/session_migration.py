@@ -18,6 +18,7 @@ leaves several copies, the newest one is the session.
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import itertools
 import logging
 import threading
@@ -33,8 +34,10 @@ from vlagents_ray.errors import VLAgentsError
 from vlagents_ray.protocol.messages import Op, Reply, Request
 from vlagents_ray.serve.engine.engine import Engine
 from vlagents_ray.serve.engine.sender import settle
+from vlagents_ray.serve.models.loaded_model import LoadedModel
 from vlagents_ray.serve.requests import NOWHERE, Origin, PendingRequest
-from vlagents_ray.serve.sessions import Outdated, Version
+from vlagents_ray.serve.sessions import Outdated, Session, Version
+from vlagents_ray.serve.weights import VersionNotHeld
 
 logger = logging.getLogger(__name__)
 
@@ -107,6 +110,13 @@ class HeldSessions:
         if state is not None:
             state["age_s"] = asked - state.pop("began")
         return state
+
+    async def weights(self, session_id: str) -> dict[str, Any] | None:
+        """Return the values of the weights with which the session acts; None if it is not here."""
+        session = next((one for one in self._engine.sessions.all() if one.id == session_id), None)
+        if session is None or session.model is None or session.weights is None:
+            return None
+        return await asyncio.to_thread(session.model.parameters.portable_values, session.weights)
 
     async def release(self, session_id: str, version: Version, claim: str) -> bool:
         """Release the session if it still has that version; return whether it was released.
@@ -246,6 +256,7 @@ class SessionMigrator:
         self._offered = 0  # number of sessions that are being fetched since other replicas offered them
         self._silent: dict[str, float] = {}  # time until which a silent replica gets no request, by its name
         self._tasks: set[asyncio.Task[Any]] = set()
+        self._fetching_weights = asyncio.Lock()  # held while a version of the weights, which may be large, is fetched
 
     def start(self, engine: Engine) -> None:
         """Set the engine whose sessions move; this migrator is its `finder`."""
@@ -384,7 +395,7 @@ class SessionMigrator:
         origin = NOWHERE if offered else self._user_of(session_id, state, began)
         if origin is None:
             return True
-        arriving = await self._in_thread(self._engine.prepare_adoption, session_id, state, _LOAD_S, began, origin)
+        arriving = await self._prepare(peer, session_id, state, began, origin)
         version = state["steps"], state["moves"]
         release = self._spawn(self._answer(peer.ask(HeldSessions.release, session_id, version, uuid.uuid4().hex)))
         while not (await asyncio.wait([release], timeout=_ANSWER_S))[0]:
@@ -398,6 +409,29 @@ class SessionMigrator:
             "session %s: fetched from another replica, after %d acts", session_id, state["steps"] - state["first"]
         )
         return True
+
+    async def _prepare(
+        self, peer: Peer, session_id: str, state: dict[str, Any], began: float, origin: Origin
+    ) -> Session[LoadedModel]:
+        """Create the copy of a session; if its version of the weights is not held here, get that from the `peer`."""
+
+        async def prepare(weights: dict[str, Any] | None = None) -> Session[LoadedModel]:
+            create = self._engine.prepare_adoption
+            arriving: Session[LoadedModel] = await self._in_thread(
+                create, session_id, state, _LOAD_S, began, origin, weights
+            )
+            return arriving
+
+        with contextlib.suppress(VersionNotHeld):
+            return await prepare()
+        async with self._fetching_weights:
+            try:
+                return await prepare()  # another session may have brought them meanwhile
+            except VersionNotHeld:
+                weights = await self._answer(peer.ask(HeldSessions.weights, session_id), _LOAD_S)
+                if weights is None:
+                    raise
+            return await prepare(weights)
 
     def _user_of(self, session_id: str, state: dict[str, Any], began: float) -> Origin | None:
         """Return the origin of a waiting request that can act on the session; None if there is no such request."""

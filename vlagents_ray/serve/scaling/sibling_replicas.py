@@ -58,6 +58,7 @@ PEER_METHODS = {
     for one in (
         PeerMethod(HeldSessions, HeldSessions.held, None),
         PeerMethod(HeldSessions, HeldSessions.copy, None),
+        PeerMethod(HeldSessions, HeldSessions.weights, _TRANSFER_S),
         PeerMethod(HeldSessions, HeldSessions.release, None),
         PeerMethod(HeldSessions, HeldSessions.take_over, None),
         PeerMethod(HeldSessions, HeldSessions.drop_older, None),
