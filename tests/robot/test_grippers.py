@@ -268,3 +268,33 @@ def test_arms_whose_openings_are_unknown_stand_until_the_first_action_that_is_ac
     assert report.safe.get("max_step", 0) + report.safe.get("dynamics", 0) > 0
     assert robot.applied > 20
     assert abs(float(robot._target[0])) < 0.5
+
+
+@pytest.mark.parametrize("broken", [np.nan, np.inf, -np.inf])
+@pytest.mark.parametrize("column", [4, 6, 7], ids=["a joint", "another joint", "the gripper"])
+def test_a_number_of_the_second_arm_that_is_not_finite_moves_neither_arm(broken: float, column: int) -> None:
+    spec = spec_of(True, 2)
+
+    class Breaking(Agent):
+        contract = Contract(action=spec, chunk=4)
+        chunks = 0
+
+        def act(self, obs: Obs) -> Act:
+            self.chunks += 1
+            rows = np.full((4, 8), 0.001, np.float32)
+            rows[:, [3, 7]] = 0.5
+            if self.chunks > 1:  # the first chunk, that of the reset, raises
+                rows[2, column] = broken
+            return Act(rows)
+
+    policy = Breaking()
+    with ChunkPlayer(policy, PlayerSettings(deadline_s=30.0), check=Guard(policy.contract)) as player:
+        player.initialize()
+        player.reset(Obs())
+        acts = [player.act(Obs()) for _ in range(12)]
+    refused = [act for act in acts if SAFE in act.info]
+    assert refused
+    for act in refused:
+        np.testing.assert_array_equal(np.delete(act.action, [3, 7]), 0.0)
+        np.testing.assert_array_equal(act.action[[3, 7]], 0.5)
+    assert np.isfinite([act.action for act in acts]).all()

@@ -110,6 +110,11 @@ def raises(error: BaseException) -> Callable[[], None]:
     return fail
 
 
+def stopped_and_broken(run: Run) -> None:
+    run.dog.trip("a person is in the way")
+    raise RuntimeError("joint 3 is too hot")
+
+
 def silence(run: Run) -> None:
     """Be silent until the watchdog has stopped the robot."""
     while "stop" not in run.arm.trace[run.arm.trace.index("EVENT") :]:
@@ -130,6 +135,7 @@ IN_OBSERVE: dict[str, Callable[[Run], Callable[[], None]]] = {
     "an error of a sensor": lambda _: raises(OSError("the camera is unplugged")),
 }
 IN_APPLY: dict[str, Callable[[Run], Callable[[], None]]] = {
+    "an error of the arm after a stop": lambda run: lambda: stopped_and_broken(run),
     "an error of the arm": lambda _: raises(RuntimeError("joint 3 is too hot")),
     "Ctrl-C in apply": lambda _: lambda: signal.raise_signal(signal.SIGINT),
 }
@@ -286,3 +292,111 @@ def test_a_trial_counts_no_step_of_the_way_to_rest(tmp_path: Path) -> None:
     arm = Arm()
     blind_trial(tmp_path, arm, Person(arm, lambda: False), Policy(relative=False), "open_loop")
     assert arm.trace.count("apply") > MAX_STEPS, "it went to rest"
+
+
+class Numbered(Agent):
+    """Chunks of three rows from the present pose on; the second column is the number of the chunk."""
+
+    def __init__(self, arm: Arm) -> None:
+        self._arm = arm
+        self.chunks = 0
+        self.begins: dict[int, Callable[[], object]] = {}  # what happens while a chunk is computed
+
+    @property
+    def contract(self) -> Contract:
+        return Contract(action=ActionSpec(dim=2, space="joint", delta=False), chunk=3)
+
+    def act(self, obs: Obs) -> Act:
+        self.chunks += 1
+        self.begins.pop(self.chunks, lambda: None)()
+        rows = np.full((3, 2), self.chunks, np.float32)
+        rows[:, 0] = obs.state["joints"][0] + 0.001 * np.arange(3)
+        return Act(rows)
+
+
+@pytest.mark.parametrize("mode", ["open_loop", "async"])
+@pytest.mark.parametrize("chunk", [1, 2, 3])
+def test_a_stop_in_the_tick_in_which_a_chunk_begins_drops_that_chunk(mode: Mode, chunk: int) -> None:
+    arm = Arm()
+    applied: list[float] = []
+    apply = arm.apply
+    arm.apply = lambda action: (applied.append(float(action[1])), apply(action))  # type: ignore[method-assign,assign]
+    policy = Numbered(arm)
+    dog = Watchdog(lambda _: arm.stop(), {"loop": 60.0})
+    policy.begins[chunk] = lambda: on_a_thread(lambda: dog.trip("a person is in the way"))
+    stopped_at: list[int] = []
+
+    def over() -> bool:
+        if dog.control.stopped and not stopped_at:
+            stopped_at.append(arm.observations)
+        if stopped_at and arm.observations == stopped_at[0] + 3:
+            assert dog.restart()
+        return len(applied) > 12
+
+    with ChunkPlayer(policy, PlayerSettings(mode)) as player:
+        run_loop(arm, player, hz=HZ, watchdog=dog, until=over)
+    stop = arm.trace.index("stop")
+    before = arm.trace[:stop].count("apply")
+    assert not applied[:before] or max(applied[:before]) < chunk
+    assert min(applied[before:]) > chunk, "the chunk of before the stop is not executed after it"
+
+
+def test_a_stop_of_one_robot_leaves_the_loop_of_another_running() -> None:
+    arms = [Arm(), Arm()]
+    dogs = [Watchdog(lambda _, arm=arm: arm.stop(), {"loop": 60.0}) for arm in arms]  # type: ignore[misc]
+    at: list[int] = []
+
+    def over() -> bool:
+        if arms[1].observations > EVENT_AT and not at:
+            dogs[0].trip("a person is in the way")
+            at.append(arms[1].trace.count("apply"))
+        return bool(at) and arms[1].trace.count("apply") > at[0] + 10
+
+    def drive(number: int) -> None:
+        with ChunkPlayer(Policy(relative=True), PlayerSettings("async")) as player:
+            run_loop(arms[number], player, hz=HZ, watchdog=dogs[number], restart="manual", until=ends[number])
+
+    ended = threading.Event()
+    ends = [ended.is_set, over]
+    other = threading.Thread(target=drive, args=(0,))
+    other.start()
+    while "apply" not in arms[0].trace:
+        time.sleep(0.001)
+    drive(1)
+    ended.set()
+    other.join()
+    assert "apply" not in arms[0].trace[arms[0].trace.index("stop") :]
+    assert arms[1].trace.index("stop") == len(arms[1].trace) - 1, "at the end alone"
+
+
+def test_after_a_lost_leader_and_a_stop_a_restart_alone_moves_nothing() -> None:
+    arm, policy = Arm(), Policy(relative=True)
+    lost: list[bool] = []
+
+    def wants() -> bool:
+        if lost:
+            raise OSError("the SpaceMouse is unplugged")
+        return True
+
+    leader = ScriptedLeader(np.full(2, 0.001, np.float32), wants)
+    dog = Watchdog(lambda _: arm.stop(), {"loop": 60.0})
+    resumed: list[int] = []
+
+    def over() -> bool:
+        if arm.observations == EVENT_AT:
+            lost.append(True)
+        elif arm.observations == EVENT_AT + 3:
+            dog.trip("a person is in the way")
+        elif arm.observations == EVENT_AT + 6:
+            assert dog.restart()
+        elif arm.observations == EVENT_AT + 9:
+            assert "apply" not in arm.trace[arm.trace.index("stop") :], "the pause of the lost leader lasts"
+            lost.clear()
+            leader.wants = lambda: False
+            dog.control.resume()
+            resumed.append(len(arm.trace))
+        return arm.observations > EVENT_AT + 30
+
+    with ChunkPlayer(policy, PlayerSettings("async"), override=leader) as player:
+        run_loop(arm, player, hz=HZ, watchdog=dog, restart="manual", until=over)
+    assert "apply" in arm.trace[resumed[0] :]
