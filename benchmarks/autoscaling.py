@@ -25,7 +25,6 @@ import typer
 from benchmarks.console import Out, save
 from benchmarks.environments import ACTION_DIM, SLEEPING_ENV
 from benchmarks.robots import RobotBurst
-from vlagents_ray.bench.line_process import LineProcess, ProcessFailed, our_environment
 from vlagents_ray.cli.console import errors, out, progress, table
 from vlagents_ray.client.transports.serve_handle import call_replica
 from vlagents_ray.errors import ConfigError
@@ -35,6 +34,7 @@ from vlagents_ray.serve.config.deployment import POLICY
 from vlagents_ray.serve.launch.deployment_file import deployment
 from vlagents_ray.serve.launch.server import running_server
 from vlagents_ray.serve.scaling.sibling_replicas import SiblingApi
+from vlagents_ray_cluster.tune.line_process import LineProcess, ProcessFailed, our_environment
 
 _SUFFIXES = (".png", ".svg", ".pdf")
 _SESSIONS, _BLUE, _GREY = "#e0a030", "#1f6f8b", "#b0b0b0"  # colours

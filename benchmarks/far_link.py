@@ -17,7 +17,7 @@ from dataclasses import asdict
 
 from benchmarks.far_carrier import DEVICE, Conditions
 from benchmarks.hosts import Host
-from vlagents_ray.bench.line_process import LineProcess, our_environment
+from vlagents_ray_cluster.tune.line_process import LineProcess, our_environment
 
 _MTU = 1500
 _ADDRESSES = ("198.19.0.1", "198.19.0.2")  # RFC 2544's, for tests of networks; hosts have the other half

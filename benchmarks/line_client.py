@@ -1,4 +1,4 @@
-"""The client's side of a benchmark's line protocol, for processes that `vlagents_ray.bench.line_process` starts.
+"""The client's side of a benchmark's line protocol, for processes that `vlagents_ray_cluster.tune.line_process` starts.
 
 A client writes one line of JSON when it is connected and warm. Then each line of its input is a number of calls to
 make, which it answers with a JSON list of their milliseconds. It ends with its standard input or with its parent. This

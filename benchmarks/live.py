@@ -31,7 +31,6 @@ from benchmarks.console import Out, save
 from benchmarks.drivers import START_S
 from benchmarks.own_clients import observation
 from benchmarks.processes import cpu_seconds
-from vlagents_ray.bench.line_process import LineProcess, our_environment
 from vlagents_ray.cli.console import errors, out, progress, table
 from vlagents_ray.client.agent import RemoteAgent
 from vlagents_ray.client.transports.select import TransportName
@@ -43,6 +42,7 @@ from vlagents_ray.serve.launch.deployment_file import deployment
 from vlagents_ray.serve.launch.server import running_server
 from vlagents_ray.serve.observers.live import LEASE_S
 from vlagents_ray.serve.python_env.child_start import die_with_parent, own_stdout
+from vlagents_ray_cluster.tune.line_process import LineProcess, our_environment
 
 ABSENT, NOBODY, RING = "tap absent", "nobody", "nobody, 30 s held"
 HZ, SATURATED_HZ = 50.0, 1e9

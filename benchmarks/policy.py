@@ -20,15 +20,6 @@ from typing_extensions import Self
 from benchmarks.console import Out, Rounds, Seconds, parse_counts, save
 from benchmarks.figures import measured_on
 from benchmarks.network import NetworkTimer, profile
-from vlagents_ray.bench.measured_policy import (
-    WARM,
-    MeasuredPolicy,
-    QueuedTurn,
-    cuda,
-    device_name,
-    forget_peak,
-    peak_mib,
-)
 from vlagents_ray.cli.console import errors, out, progress, table
 from vlagents_ray.cli.options import Set, StateDims, parse_dims, parse_settings
 from vlagents_ray.contract import Contract
@@ -37,6 +28,15 @@ from vlagents_ray.interface import Agent, Obs
 from vlagents_ray.policies.wrapper import build_agent
 from vlagents_ray.serve.config.deployment import ServerArgs
 from vlagents_ray.testing import random_observation
+from vlagents_ray_cluster.tune.measured_policy import (
+    WARM,
+    MeasuredPolicy,
+    QueuedTurn,
+    cuda,
+    device_name,
+    forget_peak,
+    peak_mib,
+)
 
 
 @dataclass(frozen=True, slots=True)

@@ -22,10 +22,10 @@ from benchmarks.peers import PYTHON, PeersPython
 from benchmarks.picture import plot_league
 from benchmarks.rtt import measure_with_peers
 from benchmarks.throughput import WITHOUT_GAIN, ThroughputPlan, measure_throughput
-from vlagents_ray.bench.line_process import ProcessFailed
 from vlagents_ray.cli.console import errors, out, progress, table
 from vlagents_ray.errors import ConfigError
 from vlagents_ray.registry import require
+from vlagents_ray_cluster.tune.line_process import ProcessFailed
 
 COMMAND = "python -m benchmarks.report"
 BEGIN, END = "<!-- bench -->", "<!-- /bench -->"

@@ -32,9 +32,9 @@ from benchmarks.far_carrier import Conditions
 from benchmarks.far_link import FarLink
 from benchmarks.hosts import Host, hosts, ray_cluster
 from benchmarks.scaling_driver import Fleet, PlayedEpisodes, ScalingRound
-from vlagents_ray.bench.line_process import LineProcess, our_environment
 from vlagents_ray.cli.console import errors, out, progress, table
 from vlagents_ray.errors import ConfigError
+from vlagents_ray_cluster.tune.line_process import LineProcess, our_environment
 
 OWN, SHARED, CHUNKS = "own", "shared", "chunks"  # applications: a replica a worker; one a node, acts and chunks
 CHUNK = 8  # rows

@@ -31,13 +31,13 @@ from benchmarks.console import Out, Rounds, Seconds, parse_counts, save, show_sk
 from benchmarks.drivers import START_S
 from benchmarks.figures import mean_interval, measured_on, median_interval
 from benchmarks.own_clients import LoadGenerator, OwnClient, observation, own_clients, save_observation
-from vlagents_ray.bench.line_process import LineProcess, our_environment
-from vlagents_ray.bench.measured_policy import rate_of
 from vlagents_ray.cli.console import errors, out, progress, table
 from vlagents_ray.cli.options import Set, parse_list, parse_settings
 from vlagents_ray.errors import ConfigError
 from vlagents_ray.serve.launch.deployment_file import deployment
 from vlagents_ray.serve.launch.server import running_server
+from vlagents_ray_cluster.tune.line_process import LineProcess, our_environment
+from vlagents_ray_cluster.tune.measured_policy import rate_of
 
 DEFAULT_TRANSPORTS = ("plasma", "handle", "shm", "websocket")
 BASE_MS, PER_ITEM_MS = 20.0, 1.0

@@ -1,9 +1,9 @@
-"""Names of policies, wrappers, environments and dialects, the location of their code, and their requirements.
+"""Names of policies, wrappers, environments, dialects and commands, the location of their code, and their requirements.
 
 A name leads to a `RegistryEntry`, whose class is imported only when it is used. Plug-ins add entries through the
-entry-point groups `vlagents_ray.policies`, `vlagents_ray.wrappers`, `vlagents_ray.envs` and `vlagents_ray.dialects`:
-an entry point names a `RegistryEntry` in a module that imports nothing large. A `"module:Class"` in a deployment file
-works without registration. Wrappers change the observations of any policy, or its actions.
+entry-point groups `vlagents_ray.policies`, `.wrappers`, `.envs`, `.dialects` and `.commands`: an entry point names a
+`RegistryEntry` in a module that imports nothing large. A `"module:Class"` in a deployment file works without
+registration. Wrappers change the observations of any policy, or its actions.
 
 The tables of README and docs/ are made from these entries: `python tests/support/tables.py`.
 """
@@ -32,10 +32,11 @@ CORE = "vlagents-ray"  # the distribution of this package
 
 @dataclass(frozen=True, slots=True)
 class RegistryEntry:
-    """A policy, wrapper, environment or dialect: where its class is, what it is, and which packages it needs."""
+    """A policy, wrapper, environment, dialect or command: where its code is, what it is, and what it needs."""
 
-    target: str  # "module:Class"
-    about: str = ""  # its models or tasks, for the tables of README and docs/; empty: no row in them
+    target: str  # "module:Class"; of a command, "module:function" or "module:app", a typer.Typer
+    # Its models or tasks, for the tables of README and docs/; empty: no row in them. Of a command, one line for --help.
+    about: str = ""
     needs: tuple[str, ...] = ()  # import names; the first one may be in a source named by `checkouts`
     requirements: tuple[str, ...] = ()  # files of requirements/ that install these, the usual one first
     extra: str | None = None  # extra of its distribution that installs them
@@ -193,8 +194,15 @@ _BUILT_IN: dict[str, dict[str, RegistryEntry]] = {
     "wrappers": WRAPPERS,
     "envs": ENVS,
     "dialects": DIALECTS,
+    "commands": {},  # those of this package are in `cli.main`
 }
-_SINGULAR = {"policies": "policy", "wrappers": "wrapper", "envs": "environment", "dialects": "dialect"}
+_SINGULAR = {
+    "policies": "policy",
+    "wrappers": "wrapper",
+    "envs": "environment",
+    "dialects": "dialect",
+    "commands": "command",
+}
 
 # extra of this package -> import names of what it installs, beside those of the adapters
 _EXTRAS: dict[str, tuple[str, ...]] = {
@@ -289,7 +297,7 @@ def pip_install(extra: str | None = None, distribution: str = CORE) -> str:
 
 
 def names(kind: str) -> list[str]:
-    """Return all names of `kind` ("policies", "wrappers", "envs" or "dialects"), those of this package first."""
+    """Return all names of a kind ("policies", "wrappers", "envs", "dialects", "commands"), this package's own first."""
     built_in = _BUILT_IN[kind]
     return [*built_in, *sorted(name for name in _entry_points(kind) if name not in built_in)]
 
@@ -440,6 +448,14 @@ def _registered_class(kind: str, name: str, unknown: type[ConfigError]) -> type[
 
 def named_class(name: str, unknown: type[ConfigError] = ConfigError) -> type[Any]:
     """Return the class given as "module:Class"; raises `unknown` if there is none."""
+    cls = load_target(name, unknown)
+    if not isinstance(cls, type):
+        raise unknown(f"{name!r}: expected a class, got a {type(cls).__name__}")
+    return cls
+
+
+def load_target(name: str, unknown: type[ConfigError] = ConfigError) -> Any:
+    """Return the object given as "module:NAME"; raises `unknown` if there is none."""
     module, colon, attribute = name.partition(":")
     if not colon:
         raise unknown(f"{name!r}: expected 'module:Class'")
@@ -455,8 +471,8 @@ def named_class(name: str, unknown: type[ConfigError] = ConfigError) -> type[Any
                 f"{did_you_mean(error.name, (file.stem for file in Path.cwd().glob('*.py')))}"
             ) from error
         raise MissingDependency(f"{name!r} needs {error.name!r}, which is not installed") from error
-    cls = getattr(loaded, attribute, None)
-    if not isinstance(cls, type):
-        classes = [one for one, value in vars(loaded).items() if isinstance(value, type)]
+    found = getattr(loaded, attribute, None)
+    if found is None:
+        classes = [other for other, value in vars(loaded).items() if isinstance(value, type)]
         raise unknown(f"{name!r}: module {module!r} has no class {attribute!r}{did_you_mean(attribute, classes)}")
-    return cls
+    return found

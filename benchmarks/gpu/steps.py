@@ -24,7 +24,6 @@ from benchmarks.checkpoints.recipes import FAMILIES, write_checkpoint
 from benchmarks.gpu.lab import INSTRUCTION, LATE_S, Acting, Lab, Session, row_error, seconds_of, view
 from benchmarks.network import profile, waits
 from benchmarks.policy import BareAndQueued
-from vlagents_ray.bench.measured_policy import forget_peak, peak_mib
 from vlagents_ray.contract import Contract
 from vlagents_ray.errors import MissingDependency, VLAgentsError
 from vlagents_ray.interface import BEHAVIOUR, DELAY, DISTRIBUTION, LEFTOVER, SAMPLES, WANT, Agent
@@ -34,6 +33,7 @@ from vlagents_ray.protocol.messages import DEFAULT_LIMITS, PROTOCOL_VERSION
 from vlagents_ray.registry import require
 from vlagents_ray.serve.engine.engine import Engine
 from vlagents_ray.serve.python_env.child_start import die_with_parent
+from vlagents_ray_cluster.tune.measured_policy import forget_peak, peak_mib
 
 ROOT = Path(__file__).resolve().parents[2]
 GPU_TESTS = ("tests/policies/compilation/test_cuda_graph.py", "tests/learn/test_one_gpu.py")  # they need no Ray

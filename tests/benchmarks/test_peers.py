@@ -29,9 +29,9 @@ from benchmarks.peers import (
 )
 from benchmarks.processes import descendants
 from benchmarks.throughput import ThroughputPlan, peer_fleet
-from vlagents_ray.bench.line_process import ProcessFailed
 from vlagents_ray.errors import ConfigError
 from vlagents_ray.serve.ports import free_port
+from vlagents_ray_cluster.tune.line_process import ProcessFailed
 
 FAKE = f"""
 import socket, sys

@@ -15,8 +15,8 @@ from benchmarks.environments import SLEEPING_ENV
 from benchmarks.hosts import hosts, ray_cluster
 from benchmarks.scaling import IMAGE_BYTES, OWN, ScalingPlan, driving, measure_cluster
 from benchmarks.scaling_driver import Fleet, PlayedEpisodes, ScalingRound
-from vlagents_ray.bench.line_process import LineProcess, our_environment
 from vlagents_ray.evaluate import Results
+from vlagents_ray_cluster.tune.line_process import LineProcess, our_environment
 
 pytestmark = pytest.mark.hosts
 

@@ -22,8 +22,8 @@ from peer_environment import package, peers_python
 from virtual_environments import ended
 
 from tests.integration.conftest import SUPPORT, serving
-from vlagents_ray.bench.line_process import LineProcess
 from vlagents_ray.serve.ports import free_port
+from vlagents_ray_cluster.tune.line_process import LineProcess
 
 ANSWER_S = 120.0  # the client's imports included
 

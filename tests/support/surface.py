@@ -228,7 +228,8 @@ def robot_options() -> Iterator[str]:
 
 def variables() -> list[str]:
     found: set[str] = set()
-    for path in (ROOT / "vlagents_ray").rglob("*.py"):
+    packages = (ROOT / "vlagents_ray", *ROOT.glob("plugins/*/vlagents_ray_*"))
+    for path in (path for package in packages for path in package.rglob("*.py")):
         found |= set(re.findall(r"\"(VLAGENTS_RAY_[A-Z_]+)\"", path.read_text()))
     return sorted(found)
 

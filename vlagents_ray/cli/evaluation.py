@@ -16,6 +16,7 @@ from rich.box import SIMPLE_HEAD
 from rich.table import Table
 
 from vlagents_ray.cli.console import fail, out
+from vlagents_ray.cli.exit_status import OUT_OF_TIME
 from vlagents_ray.cli.listing import require_packages
 from vlagents_ray.cli.policies import Agents, planned_workers, policy_deployment, resolve_policies, served
 from vlagents_ray.errors import ConfigError, PolicyFailed
@@ -42,7 +43,6 @@ from vlagents_ray.serve.access.api_keys import load_keys
 from vlagents_ray.serve.launch.deployment_file import own_settings
 from vlagents_ray.serve.models.checkpoints import CHOICE
 from vlagents_ray.serve.ports import LOOPBACK, is_free
-from vlagents_ray.slurm.submission import UNFINISHED
 
 if TYPE_CHECKING:
     from vlagents_ray.serve.scaling.sibling_replicas import ReplicasInCluster
@@ -156,7 +156,7 @@ def evaluate_and_print(
     except EvaluationInterrupted as interrupted:
         print_summary(out, interrupted.summary)
         if isinstance(interrupted, OutOfTime):
-            fail(str(interrupted), UNFINISHED)
+            fail(str(interrupted), OUT_OF_TIME)
         raise
     print_summary(out, summary)
     return summary

@@ -18,9 +18,9 @@ from vlagents_ray.cli.keys import keys
 from vlagents_ray.cli.new import new
 from vlagents_ray.cli.options import AsJson
 from vlagents_ray.cli.serve import serve_command
-from vlagents_ray.cli.slurm import slurm
-from vlagents_ray.cli.tune import tune_command
+from vlagents_ray.errors import VLAgentsError
 from vlagents_ray.naming import did_you_mean
+from vlagents_ray.registry import find_entry, load_target, names, not_installed, pip_install
 
 if TYPE_CHECKING:
     from vlagents_ray.cli.listing import Listed
@@ -109,16 +109,48 @@ for _command, _name, _line in (
     (results.replay_command, "replay", "Play an episode or a dataset again, and compare actions."),
     (results.bundle_command, "bundle", "Write an evaluation as one file that others can verify."),
     (results.verify_command, "verify", "Check a bundle, and print what is equal or differs."),
-    (tune_command, "tune", "Find the best batch size, compilation and precision."),
 ):
     app.command(_name, short_help=_line, rich_help_panel=_MORE)(_command)
 for _commands, _name, _line in (
     (env, "env", "Make Python environments for policies."),
     (keys, "keys", "Make, list and revoke the API keys of a server."),
     (new, "new", "Write a working skeleton, with its test."),
-    (slurm, "slurm", "Submit evaluations and servers as Slurm jobs."),
 ):
     app.add_typer(_commands, name=_name, short_help=_line, rich_help_panel=_MORE)
+
+
+def _add_commands_of_plugins() -> None:
+    """Add the commands of installed plug-ins; one that cannot be imported fails when it is called."""
+    for name in names("commands"):
+        try:
+            entry = find_entry("commands", name)
+            if entry is None:
+                continue
+            command = load_target(entry.target)
+        except VLAgentsError as error:
+            _add_failing(name, "It cannot be loaded.", str(error))
+            continue
+        if isinstance(command, typer.Typer):
+            app.add_typer(command, name=name, short_help=entry.about, rich_help_panel=_MORE)
+        else:
+            app.command(name, short_help=entry.about, rich_help_panel=_MORE)(command)
+    for name, distribution in not_installed("commands").items():
+        cure = pip_install(distribution=distribution)
+        message = f"command {name!r} is in {distribution}, which is not installed: {cure}"
+        _add_failing(name, f"Not installed: {cure}.", message)
+
+
+def _add_failing(name: str, line: str, message: str) -> None:
+    """Add a command that takes any arguments and fails with a message."""
+
+    def failing() -> None:
+        fail(message, 2)
+
+    context = {"allow_extra_args": True, "ignore_unknown_options": True}
+    app.command(name, short_help=line, help=message, rich_help_panel=_MORE, context_settings=context)(failing)
+
+
+_add_commands_of_plugins()
 
 
 @app.command(short_help="List policies and wrappers, and how to install them.", rich_help_panel=_MORE)

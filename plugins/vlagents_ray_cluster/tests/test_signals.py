@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 from eval_fakes import wait_for
 
-from vlagents_ray.slurm.submission import BODY
+from vlagents_ray_cluster.slurm.submission import BODY
 
 # The job's Python: finds the address, or is the command, which writes its results once it has been told to end.
 PYTHON = """#!/bin/bash

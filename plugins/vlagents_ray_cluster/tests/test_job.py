@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from vlagents_ray.slurm.job import Allocation, Ports, as_text, connection_info, end_of_job, write
+from vlagents_ray_cluster.slurm.job import Allocation, Ports, as_text, connection_info, end_of_job, write
 
 ENVIRONMENT = {"SLURM_JOB_ID": "4711", "SLURM_JOB_NUM_NODES": "3", "SLURM_NODEID": "1", "SLURM_CPUS_ON_NODE": "1"}
 

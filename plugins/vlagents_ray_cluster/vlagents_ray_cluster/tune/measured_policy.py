@@ -1,7 +1,7 @@
 """A policy in this process, behind a replica's batch queue, with timed calls; without Ray.
 
-`python -m vlagents_ray.bench.measured_policy` loads and measures one variant of a policy for `tuner`. It runs in the
-policy's own Python environment, and so needs the light install and pydantic. The first line of its input is
+`python -m vlagents_ray_cluster.tune.measured_policy` loads and measures one variant of a policy for `tuner`. It runs in
+the policy's own Python environment, and so needs the light install and pydantic. The first line of its input is
 `ProcessSettings`, as JSON. Each further line is a request, {"measure": SESSIONS, "seconds": S, "rank": RANK} or {"act":
 BATCH}, and is answered with a line of JSON. {"step": …} is a step of a long load, {"failed": …} an error.
 """

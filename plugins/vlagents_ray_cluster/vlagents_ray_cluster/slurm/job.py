@@ -1,10 +1,10 @@
 """The programs of a job, which `job.sh` starts.
 
-    python -m vlagents_ray.slurm.job address               print the address of this node, where Ray's head will run
-    python -m vlagents_ray.slurm.job node                  run Ray on this node until the step ends
-    python -m vlagents_ray.slurm.job eval [--fill CPUS] -- WORDS
-    python -m vlagents_ray.slurm.job serve [--key] --app NAME=ROUTE... -- WORDS
-    python -m vlagents_ray.slurm.job announce FOLDER PORT NAME=ROUTE...
+    python -m vlagents_ray_cluster.slurm.job address      print the address of this node, where Ray's head runs
+    python -m vlagents_ray_cluster.slurm.job node         run Ray on this node until the step ends
+    python -m vlagents_ray_cluster.slurm.job eval [--fill CPUS] -- WORDS
+    python -m vlagents_ray_cluster.slurm.job serve [--key] --app NAME=ROUTE... -- WORDS
+    python -m vlagents_ray_cluster.slurm.job announce FOLDER PORT NAME=ROUTE...
 
 `eval` and `serve` run on the first node: they wait for Ray on all nodes, and are replaced by `vlagents-ray eval` or
 `vlagents-ray serve` with the arguments WORDS. `announce` prints how to reach the server when it is ready.
@@ -198,7 +198,15 @@ def run_command(arguments: Sequence[str]) -> None:
             keys.unlink(missing_ok=True)  # keys from before the job was requeued
             key = new_key(keys, f"job-{allocation.job}")
             words.append(f"--keys={keys}")
-        announcing = [sys.executable, "-m", "vlagents_ray.slurm.job", "announce", str(folder), str(port), *given.app]
+        announcing = [
+            sys.executable,
+            "-m",
+            "vlagents_ray_cluster.slurm.job",
+            "announce",
+            str(folder),
+            str(port),
+            *given.app,
+        ]
         subprocess.Popen(announcing, env=os.environ | {KEY_VARIABLE: key})  # noqa: S603 - our own arguments
     os.execv(sys.executable, [sys.executable, "-c", _COMMAND, given.what, *words])  # noqa: S606 - no shell
 

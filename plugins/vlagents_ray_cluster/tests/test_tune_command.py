@@ -29,7 +29,7 @@ QUICK = ["--seconds", "0.1", "--max-batch", "2"]
 
 @pytest.fixture
 def file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    monkeypatch.setenv("PYTHONPATH", str(Path(__file__).parents[1] / "support"))
+    monkeypatch.setenv("PYTHONPATH", str(Path(__file__).parent / "support"))
     made = tmp_path / "mine.yaml"
     made.write_text(FILE)
     return made

@@ -9,8 +9,12 @@ from typing import Any
 import numpy as np
 import pytest
 
-from vlagents_ray.bench.measured_policy import load_observations, save_observations
-from vlagents_ray.bench.tuner import (
+from vlagents_ray.errors import ConfigError
+from vlagents_ray.evaluate import Trajectory
+from vlagents_ray.images.mp4 import Mp4
+from vlagents_ray.serve.config.deployment import BatchArgs
+from vlagents_ray_cluster.tune.measured_policy import load_observations, save_observations
+from vlagents_ray_cluster.tune.tuner import (
     GoalMissed,
     MeasuredPoint,
     TuningGoal,
@@ -22,10 +26,6 @@ from vlagents_ray.bench.tuner import (
     largest_difference,
     recorded_observations,
 )
-from vlagents_ray.errors import ConfigError
-from vlagents_ray.evaluate import Trajectory
-from vlagents_ray.images.mp4 import Mp4
-from vlagents_ray.serve.config.deployment import BatchArgs
 
 
 def record(file: Path, first: float, steps: int = 5, frames: int = 6, part: str = "arm/joints") -> None:

@@ -11,7 +11,7 @@ from typer.testing import CliRunner, Result
 
 from vlagents_ray.cli.main import app
 
-ROOT = Path(__file__).parents[2]
+ROOT = Path(__file__).parents[3]
 PAGE = ROOT / "docs" / "cluster" / "slurm.md"
 DOCUMENTED = re.findall(r"^vlagents-ray slurm (.*)$", PAGE.read_text(), re.MULTILINE)
 

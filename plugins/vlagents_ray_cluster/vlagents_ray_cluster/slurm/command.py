@@ -15,7 +15,7 @@ from vlagents_ray.cli.evaluate import EvalOptions, config_from_options, evaluate
 from vlagents_ray.cli.options import finite
 from vlagents_ray.cli.serve import serve_command
 from vlagents_ray.errors import ConfigError
-from vlagents_ray.slurm.submission import Script, first_index, split, submit
+from vlagents_ray_cluster.slurm.submission import Script, first_index, split, submit
 
 if TYPE_CHECKING:
     from vlagents_ray.evaluate import EvalConfig

@@ -19,14 +19,14 @@ arguments=("${arguments[@]//%a/${SLURM_ARRAY_TASK_ID:-%a}}")
 unset RAY_ADDRESS RAY_AUTH_TOKEN
 export RAY_AUTH_MODE=token RAY_AUTH_TOKEN_PATH=$logs/token RAY_COLOR_PREFIX=0 PATH=${python%/*}:$PATH
 (umask 077 && od -An -N32 -tx1 /dev/urandom | tr -d ' \n' >"$RAY_AUTH_TOKEN_PATH")  # the user's alone
-VLAGENTS_RAY_HEAD=$("$python" -m vlagents_ray.slurm.job address) || exit 1
+VLAGENTS_RAY_HEAD=$("$python" -m vlagents_ray_cluster.slurm.job address) || exit 1
 export VLAGENTS_RAY_HEAD
 
 srun --nodes="$SLURM_JOB_NUM_NODES" --ntasks="$SLURM_JOB_NUM_NODES" --ntasks-per-node=1 --overlap --export=ALL \
   --cpu-bind=none --kill-on-bad-exit=1 --wait=0 --open-mode=append --output="$logs/ray-%N.log" \
-  "$python" -m vlagents_ray.slurm.job node &
+  "$python" -m vlagents_ray_cluster.slurm.job node &
 ray=$!
-"$python" -m vlagents_ray.slurm.job "${arguments[@]}" &
+"$python" -m vlagents_ray_cluster.slurm.job "${arguments[@]}" &
 command=$!
 
 wait -n "$ray" "$command"

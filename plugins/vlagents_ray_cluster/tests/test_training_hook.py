@@ -13,7 +13,7 @@ from pathlib import Path
 
 import pytest
 
-from vlagents_ray.slurm import HookFailed, submit_evaluation
+from vlagents_ray_cluster.slurm import HookFailed, submit_evaluation
 
 WORDS = ["env/*", "--policy", "p", "--set", "checkpoint={checkpoint}", "--out", "runs/{step}"]
 PYTHON = """#!/bin/bash
@@ -114,6 +114,7 @@ def test_a_python_that_is_not_there_does_not_stop_training(tmp_path: Path) -> No
 
 
 def test_the_hook_needs_the_light_install_only() -> None:
-    code = "import sys, vlagents_ray.slurm; print({'ray', 'torch', 'pydantic', 'typer', 'yaml'} & set(sys.modules))"
+    heavy = {"ray", "torch", "pydantic", "typer", "yaml"}
+    code = f"import sys, vlagents_ray_cluster.slurm; print({heavy} & set(sys.modules))"
     done = subprocess.run([sys.executable, "-c", code], check=True, capture_output=True, text=True)
     assert done.stdout.strip() == "set()"

@@ -15,14 +15,14 @@ from typing import Any, Literal, get_args
 
 import numpy as np
 
-from vlagents_ray.bench.line_process import LineProcess, ProcessFailed, our_environment
-from vlagents_ray.bench.measured_policy import FRAMES, ProcessSettings, save_observations
 from vlagents_ray.errors import ConfigError, VLAgentsError
 from vlagents_ray.evaluate.artifacts.recorder import Trajectory, videos_of
 from vlagents_ray.interface import Obs
 from vlagents_ray.policies.compilation import Quantization
 from vlagents_ray.registry import require
 from vlagents_ray.serve.config.deployment import BatchArgs, ServerArgs
+from vlagents_ray_cluster.tune.line_process import LineProcess, ProcessFailed, our_environment
+from vlagents_ray_cluster.tune.measured_policy import FRAMES, ProcessSettings, save_observations
 
 _BETTER = 1.05  # factor by which a variant must be better than the file's own settings to replace them
 
@@ -281,7 +281,7 @@ class Tuner:
             dims=self._plan.dims,
         )
         found = our_environment() if environment.python is None else {}
-        command = [environment.python or sys.executable, "-m", "vlagents_ray.bench.measured_policy"]
+        command = [environment.python or sys.executable, "-m", "vlagents_ray_cluster.tune.measured_policy"]
         with LineProcess("tune", command, found | environment.env_vars, end_s=_END_S) as process:
             process.send(json.dumps(asdict(settings)))
             said = self._answer(process)

@@ -12,7 +12,15 @@ from hypothesis import example, given
 from hypothesis import strategies as st
 
 from vlagents_ray.errors import ConfigError
-from vlagents_ray.slurm.submission import BODY, Script, SubmissionFailed, first_index, outside_of_jobs, split, submit
+from vlagents_ray_cluster.slurm.submission import (
+    BODY,
+    Script,
+    SubmissionFailed,
+    first_index,
+    outside_of_jobs,
+    split,
+    submit,
+)
 
 KNOWN = {"--policy": True, "--resume": False, "--out": True}
 

@@ -109,7 +109,8 @@ class LineProcess:
 
 
 def our_environment() -> dict[str, str]:
-    """Return the environment variables with which a child process finds this package, installed or not."""
-    package = str(Path(vlagents_ray.__file__).parent.parent)
-    others = [one for one in os.environ.get("PYTHONPATH", "").split(os.pathsep) if one and one != package]
-    return {"PYTHONPATH": os.pathsep.join([package, *others])}
+    """Return the environment variables with which a child process finds this package and the core, installed or not."""
+    core = str(Path(vlagents_ray.__file__).parents[1])
+    plugin = str(Path(__file__).parents[2])
+    inherited = [folder for folder in os.environ.get("PYTHONPATH", "").split(os.pathsep) if folder]
+    return {"PYTHONPATH": os.pathsep.join(dict.fromkeys([core, plugin, *inherited]))}

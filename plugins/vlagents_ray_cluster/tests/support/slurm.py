@@ -106,7 +106,10 @@ def running_slurm(nodes: int, cpus: int) -> Iterator[Slurm]:
             configuration.write_text(_CONFIGURATION.format(head=login, folder=folder, nodes="\n".join(lines)))
             (folder / "gres.conf").write_text("Name=gpu File=/dev/null\n")  # a GPU as far as bookkeeping goes
             for one in (login, *others):
-                one.environment |= {"SLURM_CONF": str(configuration), "PYTHONPATH": PYTHONPATH}
+                one.environment |= {
+                    "SLURM_CONF": str(configuration),
+                    "PYTHONPATH": f"{PYTHONPATH}:{Path(__file__).parent}",
+                }
                 (folder / f"spool-{one.name}").mkdir()
             slurm = Slurm(login, others)
             (folder / "state").mkdir()

@@ -15,7 +15,7 @@ from vlagents_ray.cli.options import YAML_SUFFIXES, StateDims, finite, parse_dim
 from vlagents_ray.errors import ConfigError
 
 if TYPE_CHECKING:
-    from vlagents_ray.bench.tuner import MeasuredPoint
+    from vlagents_ray_cluster.tune.tuner import MeasuredPoint
 
 
 class Wanted(str, Enum):
@@ -50,9 +50,17 @@ def tune_command(
 ) -> None:
     """Find the best batch size, compilation and precision by measuring, and print the settings to change."""
     began = time.monotonic()
-    from vlagents_ray.bench.tuner import TunePlan, Tuner, TuningGoal, choose, chosen_settings, default_point, figures
     from vlagents_ray.serve.config.deployment import ServerArgs
     from vlagents_ray.serve.launch.deployment_file import policy_application
+    from vlagents_ray_cluster.tune.tuner import (
+        TunePlan,
+        Tuner,
+        TuningGoal,
+        choose,
+        chosen_settings,
+        default_point,
+        figures,
+    )
 
     with errors():
         goal = TuningGoal(wanted.value, p99_ms)
@@ -87,7 +95,7 @@ def tune_command(
 def _words(point: MeasuredPoint | None) -> str:
     if point is None:
         return "not measured, or out of the goal"
-    from vlagents_ray.bench.tuner import sessions
+    from vlagents_ray_cluster.tune.tuner import sessions
 
     figures = f"{point.actions_per_s:.1f} actions/s, p99 {point.p99_ms:.1f} ms"
     return f"{point.variant.name}, {sessions(point.sessions)}: {figures}"

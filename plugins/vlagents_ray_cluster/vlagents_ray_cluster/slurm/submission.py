@@ -11,6 +11,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+from vlagents_ray.cli.exit_status import OUT_OF_TIME
 from vlagents_ray.errors import ConfigError, VLAgentsError
 
 # Options of sbatch (22.05 to 24.11) without a value, or with a value after "=" only.
@@ -36,7 +37,6 @@ _OURS = {
 }  # fmt: skip
 BODY = Path(__file__).with_name("job.sh")
 _LINE_ENDS = "\x7f\x85\u2028\u2029"
-UNFINISHED = 75  # exit status of `vlagents-ray eval` when its time is over (EX_TEMPFAIL of sysexits.h)
 _KEPT = {"SLURM_CONF", "SLURM_CLUSTERS"}  # the location of Slurm; other variables belong to this process's own job
 _SBATCH_S = 120.0
 
@@ -91,7 +91,7 @@ class Script:
 
     name: str
     folder: Path  # for the script and the job's logs, on a file system that all nodes share
-    arguments: Sequence[str]  # of `vlagents_ray.slurm.job`
+    arguments: Sequence[str]  # of `vlagents_ray_cluster.slurm.job`
     options: Mapping[str, str | None]  # of sbatch; they override the defaults
     resubmit: int = 0  # how often to submit the job again when its time is over
     setup: Path | None = None  # a file of shell lines to run first
@@ -131,7 +131,7 @@ class Script:
             "folder": str(self.folder.absolute()),
             "setup": "" if self.setup is None else str(self.setup.absolute()),
             "resubmit": str(self.resubmit),
-            "unfinished": str(UNFINISHED),
+            "unfinished": str(OUT_OF_TIME),
         }
         lines = [
             "#!/bin/bash",

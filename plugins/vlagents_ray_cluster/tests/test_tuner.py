@@ -7,15 +7,15 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-
 from tests.bench.test_tuning import record
-from vlagents_ray.bench.tuner import TunePlan, Tuner, TuningGoal, VariantFailed, choose
+
 from vlagents_ray.errors import ConfigError
 from vlagents_ray.serve.config.deployment import ServerArgs
+from vlagents_ray_cluster.tune.tuner import TunePlan, Tuner, TuningGoal, VariantFailed, choose
 
 pytestmark = pytest.mark.slow  # each variant is measured in a process of its own
 
-SUPPORT = str(Path(__file__).parents[1] / "support")
+SUPPORT = str(Path(__file__).parent / "support")
 
 
 @pytest.fixture(autouse=True)

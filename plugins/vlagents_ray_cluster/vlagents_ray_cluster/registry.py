@@ -1,0 +1,13 @@
+"""What this distribution registers: an entry for each command."""
+
+from vlagents_ray.registry import RegistryEntry
+
+TUNE = RegistryEntry(
+    "vlagents_ray_cluster.tune.command:tune_command",
+    "Find the best batch size, compilation and precision.",
+)
+
+SLURM = RegistryEntry(
+    "vlagents_ray_cluster.slurm.command:slurm",
+    "Submit evaluations and servers as Slurm jobs.",
+)
