@@ -75,6 +75,7 @@ def played(
     *,
     episodes: int = 2,
     own_weights: str | None = None,
+    stated: dict[str, Any] | None = None,
     description: dict[str, Any] | None = None,
     contract: dict[str, Any] | None = None,
     **changes: Any,
@@ -82,7 +83,7 @@ def played(
     """Play the episodes of a plan that have no result, without a simulator."""
     settings = {"envs": ["prog_env:Sea"], "episodes": episodes, "env_options": {"folder": "chart.txt"}, "policy": "own"}
     config = flat_config(**{**settings, "out": out, **changes})
-    said = served(own_weights)
+    said = served(own_weights) | (stated or {})
     with Store(config) as store:
         store.begin_run(config, {})
         for job in plan(store.cells):
@@ -255,6 +256,52 @@ def test_every_command_refuses_another_environment_unless_the_change_is_accepted
 @pytest.mark.parametrize("command", COMMANDS)
 def test_no_command_refuses_the_same_environment(work: Path, tmp_path: Path, command: Callable[..., Results]) -> None:
     assert command(tmp_path, lambda: None).accepted_changes == []
+
+
+# Settings that a deployment file gives a policy, and that no plan names: before, after, and the change's name.
+OF_THE_POLICY: dict[str, tuple[dict[str, Any], dict[str, Any], str]] = {
+    "a setting": ({"config": {"steps": 4}}, {"config": {"steps": 8}}, "its setting 'steps' was 4, is 8"),
+    "a setting more": ({"config": {}}, {"config": {"steps": 8}}, "its setting 'steps' was None, is 8"),
+    "a wrapper": ({"wrappers": []}, {"wrappers": ["arro"]}, 'its wrappers was [], is ["arro"]'),
+    "a wrapper's setting": (
+        {"wrappers": [{"half": {"scale": 0.5}}]},
+        {"wrappers": [{"half": {"scale": 0.9}}]},
+        'its wrappers was [{"half":{"scale":0.5}}], is [{"half":{"scale":0.9}}]',
+    ),
+    "the order of wrappers": ({"wrappers": ["a", "b"]}, {"wrappers": ["b", "a"]}, "its wrappers was"),
+}
+
+
+@pytest.mark.parametrize("identity", OF_THE_POLICY)
+def test_other_settings_of_a_policy_in_its_file_are_refused_unless_they_are_accepted(
+    work: Path, tmp_path: Path, identity: str
+) -> None:
+    before, after, message = OF_THE_POLICY[identity]
+
+    def folders(name: str) -> list[Path]:
+        return [tmp_path / name / folder for folder in ("a", "b", "c")]
+
+    first, second, merged_into = folders("merged")
+    played(first, stated=before)
+    played(second, stated=after, seed=100)
+    with pytest.raises(ConfigError, match=rf"(?s){re.escape(message)}.*--accept-changes"):
+        merge(merged_into, [first, second])
+    with pytest.raises(ConfigError, match=rf"(?s){re.escape(message)}.*--accept-changes"):
+        played(first, stated=after, episodes=4, resume=True)
+    played(first, stated=after, episodes=4, resume=True, accept_changes=True)
+    assert any(message.partition(" was")[0] in str(change) for change in Results.load(first).accepted_changes)
+    played(tmp_path / "other", policy="another")
+    both = combined([Results.load(first), Results.load(tmp_path / "other")])
+    with pytest.raises(ConfigError, match=r"(?s)were played with .*settings of 'own'.*as --accept-changes allowed"):
+        compare(both, "own", "another")
+
+
+def test_settings_of_the_checkpoint_and_of_the_machine_are_no_change(work: Path, tmp_path: Path) -> None:
+    """The checkpoint has its own comparison, and a server without these fields has stated nothing."""
+    played(tmp_path, stated={"config": {"checkpoint": "a/1", "steps": 4}})
+    played(tmp_path, stated={"config": {"checkpoint": "w.npz", "steps": 4}}, episodes=3, resume=True)
+    played(tmp_path, episodes=4, resume=True)
+    assert Results.load(tmp_path).accepted_changes == []
 
 
 @pytest.mark.parametrize("identity", ["its simulator's version", "its contract", "its policy's code", "its weights"])

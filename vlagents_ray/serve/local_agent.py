@@ -60,6 +60,7 @@ def policy_metadata(args: ServerArgs, engine: Engine, code: GitState | None, pro
         "policy_version": engine.weights.describe(),
         "checkpoints": models.describe(),
         "config": models.config,
+        "wrappers": args.wrappers,
         "contract": None if contract is None else contract.to_json(),
         "continues_plans": models.continues_plans,
         "version": importlib.metadata.version("vlagents-ray"),

@@ -187,6 +187,25 @@ def test_a_recording_that_is_changed_alone_contradicts_the_bundle(forged: Forge,
     assert not forged(change).holds
 
 
+OUTCOME = ("success_once", "success_at_end", "first_success", "steps", "episode_return", "ending", "actions_sha256")
+
+
+def test_a_failure_with_outcome_and_recording_of_a_success_is_found_by_its_replay(forged: Forge) -> None:
+    """Table and recordings agree with each other, and every value is one that was measured."""
+
+    def copy(folder: Path) -> None:
+        with closing(sqlite3.connect(folder / "results.db")) as db, db:
+            [success] = db.execute(f"SELECT trajectory, {', '.join(OUTCOME)} FROM episodes WHERE {SOLVED}").fetchall()
+            [[failure]] = db.execute(f"SELECT trajectory FROM episodes WHERE {FAILED}").fetchall()
+            values = ", ".join(f"{column} = ?" for column in OUTCOME)
+            db.execute(f"UPDATE episodes SET {values} WHERE trajectory = ?", [*success[1:], failure])
+        (folder / failure).write_bytes((folder / success[0]).read_bytes())
+
+    found = forged(copy)
+    assert not found.holds
+    assert next(one.subject for one in found.findings if one.verdict == "differs").startswith("replay of")
+
+
 def test_a_recording_of_an_episode_that_was_left_out_is_named(forged: Forge) -> None:
     found = forged(update(f"DELETE FROM episodes WHERE {FAILED}"))
     [detail] = [one.detail for one in found.findings if one.verdict == "differs"]

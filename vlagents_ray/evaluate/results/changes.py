@@ -6,9 +6,10 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
-from vlagents_ray.evaluate.plan.config import fingerprint
+from vlagents_ray.evaluate.plan.config import canonical, fingerprint
 
 IDENTITY = ("policy", "checkpoint", "weights")  # of a policy's metadata
+_OF_CHECKPOINT = {"checkpoint", "checkpoint_step"}  # settings that the identity's "checkpoint" has
 _SWEPT = "checkpoint: "  # prefix of a file that each step of a sweep has
 _DIGITS = 12  # of a digest that a person reads
 MIX = "bring the old files back, give a new folder (--out), or mix both and have the report say so (--accept-changes)"
@@ -34,6 +35,10 @@ class Change:
         """Return whether the description or the contract of this env changed (`env_changes`)."""
         kinds = tuple(f"its {kind} " for kind in EnvStatement._fields)
         return self.subject == f"env {env}" and self.name.startswith(kinds)
+
+    def is_setting_of(self, policy: str) -> bool:
+        """Return whether the settings of this policy or of its wrappers changed (`policy_changes`)."""
+        return self.subject == f"policy {policy}" and self.name.startswith("its ")
 
     def __str__(self) -> str:
         return f"{self.subject}: {self.name} was {_short(self.was)}, is {_short(self.now)}"
@@ -80,12 +85,30 @@ def changed(known: Mapping[str, Any], now: Mapping[str, Any], *, swept: bool) ->
 
 
 def policy_changes(subject: str, known: Mapping[str, Any], now: Mapping[str, Any], *, swept: bool) -> list[Change]:
-    """Compare the files and the weights that two metadata of a policy's server state; the weights come last."""
+    """Compare files, settings and weights that two metadata of a policy's server state; the weights come last."""
     found = program_changes(subject, policy_program(known, swept=swept), policy_program(now, swept=swept))
+    found += _settings_changes(subject, known, now)
     before, after = ((metadata.get("weights") or {}).get("digest") for metadata in (known, now))
     if not swept and before and after and before != after:
         found.append(Change(subject, "weights", before, after))
     return found
+
+
+def _settings_changes(subject: str, known: Mapping[str, Any], now: Mapping[str, Any]) -> list[Change]:
+    """Compare the settings of a policy and its wrappers, such as those in a deployment file."""
+    changes: list[Change] = []
+    before, after = known.get("config"), now.get("config")
+    if before is not None and after is not None:
+        names = sorted((before.keys() | after.keys()) - _OF_CHECKPOINT)
+        changes += [
+            Change(subject, f"its setting {name!r}", repr(before.get(name)), repr(after.get(name)))
+            for name in names
+            if before.get(name) != after.get(name)
+        ]
+    before, after = known.get("wrappers"), now.get("wrappers")
+    if before is not None and after is not None and before != after:
+        changes.append(Change(subject, "its wrappers", canonical(before), canonical(after)))
+    return changes
 
 
 def policy_program(metadata: Mapping[str, Any], *, swept: bool) -> dict[str, str] | None:

@@ -231,6 +231,9 @@ def _mixed(results: Results, cell: CellResults, other: CellResults) -> list[str]
             mixed.append(f"{len(programs)} versions of the files of {each.contender!r}")
         if len(weights) > 1:
             mixed.append(f"{len(weights)} weights of {each.contender!r}")
+        settings = [change for change in results.accepted_changes if change.is_setting_of(each.policy)]
+        if settings:
+            mixed.append(f"several settings of {each.contender!r} ({'; '.join(map(str, settings))})")
     stated = [change for change in results.accepted_changes if change.is_statement_of(cell.env)]
     if stated:
         mixed.append(f"several versions of the environment ({'; '.join(map(str, stated))})")
