@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from tests.bench.test_tuning import record
+from tuned_recordings import record
 
 from vlagents_ray.errors import ConfigError
 from vlagents_ray.serve.config.deployment import ServerArgs

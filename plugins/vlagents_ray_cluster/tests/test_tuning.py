@@ -8,10 +8,9 @@ from typing import Any
 
 import numpy as np
 import pytest
+from tuned_recordings import record
 
 from vlagents_ray.errors import ConfigError
-from vlagents_ray.evaluate import Trajectory
-from vlagents_ray.images.mp4 import Mp4
 from vlagents_ray.serve.config.deployment import BatchArgs
 from vlagents_ray_cluster.tune.measured_policy import load_observations, save_observations
 from vlagents_ray_cluster.tune.tuner import (
@@ -26,21 +25,6 @@ from vlagents_ray_cluster.tune.tuner import (
     largest_difference,
     recorded_observations,
 )
-
-
-def record(file: Path, first: float, steps: int = 5, frames: int = 6, part: str = "arm/joints") -> None:
-    """Observation i has first + i as its joints, and an image as bright as 20 i."""
-    state = {part: first + np.arange(steps + 1, dtype=np.float32)[:, None] * np.ones(2, np.float32)}
-    trajectory = Trajectory(
-        np.zeros((steps, 2), np.float32), np.zeros(steps), np.zeros(steps, bool), state,
-        np.linspace(0, 1, steps + 1, dtype=np.float32), ("front",), np.full(steps, -1),
-    )  # fmt: skip
-    file.parent.mkdir(parents=True, exist_ok=True)
-    file.write_bytes(trajectory.to_bytes())
-    video = Mp4(file.with_name(f"{file.stem}_front.mp4"), (16, 16, 3), 20)
-    for i in range(frames):
-        video.add(np.full((16, 16, 3), 20 * i, np.uint8))
-    video.finish()
 
 
 def test_they_are_spread_over_episodes_and_their_steps(tmp_path: Path) -> None:

@@ -8,8 +8,8 @@ from typing import Any
 
 import numpy as np
 import pytest
+from tiny_arro import make_grounding_dino, make_sam2
 
-from tests.families.arro.tiny import make_grounding_dino, make_sam2
 from vlagents_ray import Act, Agent, Obs
 from vlagents_ray.errors import ConfigError
 from vlagents_ray.serve.models.agent_copies import AgentCopies

@@ -1,6 +1,6 @@
 """Small random checkpoints of SAM 2 and Grounding DINO, made by transformers itself.
 
-python tests/families/arro/tiny.py FOLDER: writes FOLDER/sam2 and FOLDER/grounding_dino.
+python plugins/vlagents_ray_arro/tests/support/tiny_arro.py FOLDER: writes FOLDER/sam2 and FOLDER/grounding_dino.
 """
 
 from __future__ import annotations
