@@ -8,13 +8,14 @@ import fcntl
 import gc
 import http.client
 import os
-import queue
 import socket
 import struct
 import threading
 import time
 import zlib
 from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from functools import partial
 from pathlib import Path
 from typing import Any
 from urllib.parse import urlsplit
@@ -33,7 +34,9 @@ from api_key_replica import (
     over_websocket,
 )
 from eval_fakes import wait_for
+from gr00t_client import PolicyClient
 from in_flight import read_requests
+from in_memory_keys import ChangingKeys
 from probes import bytes_probe, is_probe_answer
 from websockets.exceptions import InvalidStatus
 
@@ -783,19 +786,38 @@ def test_parts_of_messages_before_a_key_are_bounded_at_groots_gateway(monkeypatc
     dialect.close()
 
 
-def test_requests_that_wait_at_groots_gateway_count_as_in_flight() -> None:
-    admission = Admission(3 * 10**6)
-    context = GatewayContext("app", _no_replica, DEFAULT_LIMITS, 8, 30.0, None, NoKey.OPEN, admission)
-    answers: queue.SimpleQueue[tuple[gr00t.Envelope, bytes]] = queue.SimpleQueue()
+def test_a_request_at_groots_gateway_counts_as_in_flight_for_its_key() -> None:
+    admission, connecting = Admission(4 * 10**6), threading.Event()
+
+    def connect(*_: object) -> RemoteAgent:
+        connecting.wait(20)
+        raise PolicyUnavailable("there is no replica")
+
+    known = ChangingKeys()
+    tokens = [known.add("one"), known.add("another")]
+    check = partial(known.keys.check, app="app")
+    context = GatewayContext("app", connect, DEFAULT_LIMITS, 8, 30.0, None, check, admission)
     dialect = gr00t.GR00TDialect("gr00t", gr00t.GR00TDialectConfig(), context)
-    client = gr00t.GR00TConnection(context, dialect.mapping, lambda *answer: answers.put(answer))
-    with pytest.raises((Overloaded, MessageTooLarge)):
-        client.put((b"id",), bytes(4 * 10**6))
-    assert client.put((b"id",), bytes(10**6))
-    assert answers.get(timeout=10)[0] == (b"id",)
-    assert admission.held == 0
-    client.end()
-    client.thread.join(10)
+    listener = socket.create_server(("127.0.0.1", 0))
+    port = listener.getsockname()[1]
+    dialect.serve(listener)
+    seen = {"video": {"ego": np.zeros((1, 1, 500, 800, 3), np.uint8)}, "state": {}, "language": {"task": [["go"]]}}
+
+    def error_of(token: str, observation: dict[str, Any]) -> str:
+        with PolicyClient(port, token) as client, pytest.raises(RuntimeError) as refused:
+            client.get_action(observation)
+        return str(refused.value)
+
+    with ThreadPoolExecutor(3) as clients:
+        first = clients.submit(error_of, tokens[0], seen)  # 1.2 MB, which waits for a replica
+        wait_for(lambda: admission.held > 10**6)
+        assert "overloaded" in error_of(tokens[0], seen)  # the share of a key is half
+        other = clients.submit(error_of, tokens[1], seen)
+        wait_for(lambda: admission.held > 2 * 10**6)
+        connecting.set()
+        assert "no replica" in first.result()
+        assert "no replica" in other.result()
+    wait_for(lambda: admission.held == 0)
     dialect.close()
 
 

@@ -50,12 +50,17 @@ class Observations:
     paired: bool  # whether the reply is [action, info], as in N1.6 and newer, or only the action, as in N1.5
 
 
+_TOKEN_BYTES = 4096  # maximum size of an API key, and of the names of the fields before it
+
+
 def read_token(payload: bytes | memoryview, limits: Limits) -> str | None:
     """Return the API key in a message without decoding the other fields; None if it has none."""
     if len(payload) > limits.body_bytes:
         raise MessageTooLarge(f"gr00t: a message of {len(payload)} bytes, the limit is {limits.body_bytes}")
     package = require("msgpack")
-    reader = package.Unpacker(max_buffer_size=limits.body_bytes, max_array_len=0, max_map_len=limits.items)
+    reader = package.Unpacker(
+        max_buffer_size=limits.body_bytes, max_array_len=0, max_map_len=limits.items, max_str_len=_TOKEN_BYTES
+    )
     try:
         reader.feed(payload)
         for _ in range(reader.read_map_header()):

@@ -120,14 +120,16 @@ def test_a_message_without_a_key_leaves_nothing_behind(gateway: Gateway, name: s
     with gateway.connect(zmq.REQ) as robot:
         assert gateway.ping(robot, "vlr_robot")["status"] == "ok"
         before = resident()
-        for _ in range(12 if "large" in name else 3):
+        for number in range(12 if "large" in name else 3):
             identity, parts = MESSAGES[name]()
             with gateway.connect(identity=identity) as peer:
                 peer.send_multipart(parts, copy=False)
                 peer.poll(100)
                 assert gateway.ping(robot, "vlr_robot")["status"] == "ok"
-                assert (gateway.clients, threads()) == (1, 1)
-        wait_for(lambda: gateway.admission.held == 0)
+                assert gateway.clients == 1
+                assert threads() <= 2 + number  # one for each connection, whatever it sends
+        wait_for(lambda: threads() == 1)
+        assert gateway.admission.held == gateway.dialect.of_strangers.held == 0
         wait_for(lambda: resident() - before < MEMORY)
 
 
@@ -165,7 +167,8 @@ def test_a_flood_without_keys_takes_no_place_and_no_thread(gateway: Gateway, cho
             late = [gateway.connect(zmq.REQ) for _ in range(PLACES - 1)]
             for peer in late:
                 assert gateway.ping(peer, "vlr_robot")["status"] == "ok"
-            assert (gateway.clients, threads()) == (PLACES, PLACES)
+            assert gateway.clients == PLACES
+            assert threads() <= PLACES + gr00t._STRANGERS
             for peer in late:
                 peer.close()
         finally:
@@ -177,11 +180,11 @@ def test_a_flood_without_keys_takes_no_place_and_no_thread(gateway: Gateway, cho
 def test_a_stranger_with_the_identity_of_a_client_stays_a_stranger(gateway: Gateway) -> None:
     with gateway.connect(zmq.REQ, b"robot-1") as robot:
         assert gateway.ping(robot, "vlr_robot")["status"] == "ok"
-    with gateway.connect(zmq.REQ, b"robot-1") as peer:  # the gateway still has that client, which may come back
-        assert "unauthorized" in gateway.ping(peer, "vlr_wrong")["error"]
-        assert gateway.dialect._strangers is not None
-        assert len(gateway.dialect._strangers) == 1
-    assert gateway.clients == 1
+        with gateway.connect(zmq.REQ, b"robot-1") as peer:
+            assert "unauthorized" in gateway.ping(peer, "vlr_wrong")["error"]
+            assert len(gateway.dialect._strangers) == 1
+            assert gateway.ping(robot, "vlr_robot")["status"] == "ok"
+            assert gateway.clients == 1
 
 
 def test_a_connection_whose_messages_have_no_key_is_closed_after_some(gateway: Gateway) -> None:
@@ -206,8 +209,7 @@ def test_a_client_with_a_revoked_key_is_a_stranger_again(gateway: Gateway) -> No
     with gateway.connect(zmq.REQ) as robot:
         assert gateway.ping(robot, "vlr_robot")["status"] == "ok"
         gateway.keys.change("robot", revoked=True)
-        wait_for(lambda: gateway.clients == 0)
+        wait_for(lambda: gateway.clients == 0 and threads() == 0)
         assert "revoked" in gateway.ping(robot, "vlr_robot")["error"]
-        assert gateway.dialect._strangers is not None
         assert len(gateway.dialect._strangers) == 1
         assert gateway.clients == 0

@@ -221,6 +221,11 @@ class GatewayClients(Generic[K, C]):
         finally:
             _end(removed)
 
+    def remove(self, key: K) -> None:
+        """Remove a client that has ended, if it is known."""
+        with self._lock:
+            self._clients.pop(key, None)
+
     def forget_quiet(self) -> None:
         """End the sessions of idle clients and of clients whose key is no longer valid."""
         now = time.monotonic()

@@ -1,123 +1,271 @@
-"""GR00T's `PolicyClient`s over ZeroMQ: one ROUTER socket for all clients, and a session and a thread for each."""
+"""GR00T's `PolicyClient`s over ZeroMQ's protocol: a session and a thread for each connection."""
 
 from __future__ import annotations
 
 import contextlib
 import logging
-import os
-import queue
 import re
 import socket
-import struct
 import threading
 import time
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from typing import Any
 
 from pydantic import Field
 
 from vlagents_ray.contract import Contract
-from vlagents_ray.errors import MalformedMessage, PolicyUnavailable, VLAgentsError
+from vlagents_ray.errors import MalformedMessage, MessageTooLarge, Overloaded, PolicyUnavailable, VLAgentsError
+from vlagents_ray.protocol.websocket_frames import CONTROL_FRAMES, CONTROL_FRAMES_PER_S
 from vlagents_ray.registry import require
-from vlagents_ray.serve.access.api_keys import NoKey
+from vlagents_ray.serve.access.api_keys import Caller, NoKey
 from vlagents_ray.serve.config.dialects import MappingSetting, PortConfig
 from vlagents_ray.serve.dialects.base import GatewayContext, PortDialect
+from vlagents_ray.serve.dialects.client_reader import ClientReader, share_of, shut_down
 from vlagents_ray.serve.dialects.gateway_sessions import GatewayClient, GatewayClients, internal_error
-from vlagents_ray.wire import gr00t
+from vlagents_ray.serve.engine.admission import Admission
+from vlagents_ray.serve.token_bucket import TokenBucket
+from vlagents_ray.wire import gr00t, zmtp
 from vlagents_ray.wire.gr00t import PRESETS, GR00TRequest, Observations
 from vlagents_ray.wire.mapping import KeyMapping, matches
 
 logger = logging.getLogger(__name__)
 
 _FOLDER = re.compile(r"^(video|state|language)\.")
-WAITING = 4  # maximum number of waiting requests of one client; a REQ socket sends one at a time
-# The parts of a message before its payload: ZeroMQ's identity of the connection, and those that a client adds. A REQ
-# socket adds an empty part, a DEALER socket whatever its program chooses.
+# The parts of a message before its payload. A REQ socket adds an empty one, a DEALER socket those of its program.
 Envelope = tuple[bytes, ...]
-_ENVELOPES: tuple[list[bytes], ...] = ([], [b""])  # the parts that a client may add
-_MOST_PARTS, _MOST_PART_BYTES = 4, 256  # of an envelope that is answered with an error; others are ignored
-_HEARTBEAT_MS = 10_000
-_TICK_MS = 500
-_END_S = 3.0
-_LINGER_MS = 1000  # time for sending the last answers
-_STRANGERS = 64  # maximum number of connections without a valid key
-_STRANGERS_MS = 50  # period at which their bytes are counted
+_ENVELOPES: tuple[Envelope, ...] = ((), (b"",))  # those of clients that are connected directly
+_MOST_PARTS, _MOST_PART_BYTES = 4, 256  # of an envelope that is answered with an error; others end the connection
+_KEEPALIVE = (("TCP_KEEPIDLE", 20), ("TCP_KEEPINTVL", 5), ("TCP_KEEPCNT", 3), ("TCP_USER_TIMEOUT", 35_000))
+_HANDSHAKE_S = 5.0
+_MESSAGE_S = 30.0  # maximum time of a message, from its first byte to its last
+_SEND_S = 10.0  # maximum time for a client to accept an answer
+_TICK_S = 0.5  # period at which idle clients and keys are checked
+_END_S = 3.0  # maximum time for the answers to requests when the dialect ends
+_LINGER_S = 1.0  # and for refusing those that have arrived by then
+_STRANGERS = 64  # maximum number of connections without a valid key; a further one ends the oldest
 _STRANGER_S = 30.0  # time within which a connection must send a valid key
 _REFUSALS = 64  # messages without a valid key after which a connection is closed
-_RECEIVED = struct.Struct("<Q")  # `tcpi_bytes_received` in Linux' `struct tcp_info`
-_RECEIVED_AT = 128
+_REFUSAL_S = 0.1  # time for which a connection is not read after such a message, as reading a key takes time
+_ACCEPTED_PER_S = 50.0  # maximum number of connections in a second; each takes a thread and about a millisecond
 
 
 class GR00TConnection(GatewayClient):
-    """One client's requests, which are processed one after the other on a separate thread."""
+    """One connection of a client, from its first byte to its last; a thread processes its requests in order.
 
-    def __init__(self, context: GatewayContext, mapping: KeyMapping, answer: Callable[[Envelope, bytes], None]) -> None:
-        """Start the client's thread, which calls `answer` with the envelope of a request and the answer to it."""
-        super().__init__(context)
-        self._mapping, self._flat = nested_mapping(mapping)  # flat: whether the client's last keys were N1.5's
-        self._send = answer
-        self._requests: queue.SimpleQueue[tuple[Envelope, bytes] | None] = queue.SimpleQueue()
-        self._waiting: list[Envelope] = []  # the envelopes of the requests without an answer
-        self._lock = threading.Lock()
+    It is a stranger until one of its messages has a valid key, or needs none; then it is one of the dialect's clients.
+    """
+
+    def __init__(self, dialect: GR00TDialect, connection: socket.socket) -> None:
+        super().__init__(dialect.context)
+        self._dialect, self._connection = dialect, connection
+        # flat: whether the client's last keys were N1.5's
+        self._mapping, self._flat = nested_mapping(dialect.mapping)
+        self._is_robot = dialect.config.rank == "robot"
+        self._share = share_of(connection)  # whose share of the bytes in flight its messages take
+        self._reader = ClientReader(connection, dialect.of_strangers, robot=True)
+        self._commands = TokenBucket(CONTROL_FRAMES_PER_S, time.monotonic(), CONTROL_FRAMES)
+        self._valid_until = time.monotonic() + _STRANGER_S  # time at which a stranger is disconnected, s
+        self._refused = 0  # number of messages without a valid key
+        self._sending = threading.Lock()  # guards sending, and the next field
+        self._waiting: Envelope | None = None  # the envelope of the request without an answer
+        self._answered = threading.Condition()
+        self.is_client = False  # whether it counts among the dialect's clients
         self.thread = threading.Thread(target=self._run, name="gr00t-client", daemon=True)
-        self.thread.start()
-
-    def put(self, envelope: Envelope, payload: bytes) -> bool:
-        """Queue a request; return False if too many are waiting.
-
-        Raises:
-            Overloaded: The requests of all clients leave no memory for it.
-        """
-        with self._lock:
-            if self._unanswered >= WAITING:
-                return False
-            self._context.admission.hold(len(payload), True, 0)
-            self._unanswered += 1
-            self._waiting.append(envelope)
-        self._requests.put((envelope, payload))
-        return True
 
     def end(self) -> None:
-        self._requests.put(None)
+        """Process what has arrived, then end the sessions and the connection."""
+        self.is_client = False
+        shut_down(self._connection, socket.SHUT_RD)
 
-    def unanswered(self) -> list[Envelope]:
-        """Return the envelopes of the requests without an answer, which then get none from this client's thread."""
-        with self._lock:
-            waiting, self._waiting = self._waiting, []
-        return waiting
+    def cut_off(self, reason: str) -> None:
+        """End the connection at once; may be called on any thread."""
+        logger.info("gr00t: a connection is closed: %s", reason)
+        shut_down(self._connection)
+
+    def wait_answered(self, until: float) -> None:
+        """Wait until no request is unanswered, or until a time of `time.monotonic()`, s."""
+        with self._answered:
+            self._answered.wait_for(lambda: not self._unanswered, max(0.0, until - time.monotonic()))
+
+    def refuse_waiting(self, error: VLAgentsError) -> None:
+        """Answer the request that is being processed, if there is one, with an error; may be called on any thread."""
+        self._send(_error(error))
 
     def _run(self) -> None:
-        while (request := self._requests.get()) is not None:
-            envelope, payload = request
-            message = self._answer(payload)
-            self._context.admission.release(len(payload))
-            with self._lock:
-                self._unanswered -= 1
-                self._used = time.monotonic()
-                is_waiting = envelope in self._waiting
-                if is_waiting:
-                    self._waiting.remove(envelope)
-            if is_waiting:
-                self._send(envelope, message)
-            time.sleep(self.sessions.throttled_s())
-        self.sessions.close()
-
-    def _answer(self, payload: bytes) -> bytes:
         try:
-            check = self._context.check
-            if isinstance(check, NoKey):
-                self.sessions.show(check, None)
+            self._connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+            self._connection.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
+            for name, value in _KEEPALIVE:
+                if hasattr(socket, name):
+                    self._connection.setsockopt(socket.IPPROTO_TCP, getattr(socket, name), value)
+            self._greet()
+            while (head := self._receive_head()) is not None:
+                self._process(*head)
+        except (VLAgentsError, OSError) as error:
+            logger.info("gr00t: disconnected a client: %s", error)
+        except Exception:
+            logger.exception("gr00t: disconnected a client")
+        finally:
+            self._dialect.remove(self)
+            shut_down(self._connection)
+            self._connection.close()
+            self.sessions.close()
+
+    # ZeroMQ's protocol.
+
+    def _greet(self) -> None:
+        deadline = time.monotonic() + _HANDSHAKE_S
+        self._connection.settimeout(_HANDSHAKE_S)
+        self._connection.sendall(zmtp.GREETING)
+        greeting = bytearray()
+        for size in (1, 10, zmtp.GREETING_BYTES - 11):  # old peers send less, and then wait
+            greeting += self._read(size, _HANDSHAKE_S, deadline)
+            zmtp.check_greeting(greeting)
+        self._connection.sendall(zmtp.write_ready())
+        flags = zmtp.read_flags(self._read(1, _HANDSHAKE_S, deadline)[0])
+        name, properties = self._read_command(flags, deadline)
+        if name != b"READY":
+            raise MalformedMessage(f"zmtp: expected READY, got {name!r}")
+        zmtp.check_ready(properties)
+
+    def _read(self, length: int, silent_s: float, deadline: float) -> memoryview:
+        data = self._reader.read(length, silent_s, deadline)
+        if data is None:
+            raise ConnectionResetError("the client disconnected")
+        return data
+
+    def _read_command(self, flags: zmtp.FrameFlags, deadline: float) -> tuple[bytes, bytes]:
+        size = zmtp.read_size(self._read(flags.size_bytes, _MESSAGE_S, deadline))
+        if not flags.is_command or size > zmtp.COMMAND_BYTES:
+            raise MalformedMessage(f"zmtp: expected a command of at most {zmtp.COMMAND_BYTES} bytes, got {size}")
+        return zmtp.read_command(self._read(size, _MESSAGE_S, deadline))
+
+    def _receive_head(self) -> tuple[Envelope, int, float] | None:
+        """Receive a message up to its payload.
+
+        Returns:
+            Its envelope, the size of its payload in bytes, and the time at which the payload must have arrived, s; None
+            if the client has disconnected.
+        """
+        envelope: list[bytes] = []
+        deadline = float("inf")
+        while True:
+            wait_s = self._context.idle_s if self.is_client else max(0.0, self._valid_until - time.monotonic())
+            first = self._reader.read(zmtp.HEAD_BYTES, wait_s, deadline)
+            if first is None:
+                return None
+            deadline = min(deadline, time.monotonic() + _MESSAGE_S)
+            flags = zmtp.read_flags(first[0])
+            if flags.is_command:
+                self._process_command(*self._read_command(flags, deadline))
+                if not envelope:
+                    deadline = float("inf")
+                continue
+            size = zmtp.read_size(self._read(flags.size_bytes, _MESSAGE_S, deadline))
+            if not flags.has_more:
+                if size > self._context.limits.body_bytes:
+                    raise MessageTooLarge(
+                        f"gr00t: a message of {size} bytes, the limit is {self._context.limits.body_bytes}"
+                    )
+                return tuple(envelope), size, deadline
+            if len(envelope) == _MOST_PARTS or sum(map(len, envelope)) + size > _MOST_PART_BYTES:
+                raise MalformedMessage(
+                    f"gr00t: expected an envelope of at most {_MOST_PARTS} parts and {_MOST_PART_BYTES} bytes"
+                )
+            envelope.append(bytes(self._read(size, _MESSAGE_S, deadline)))
+
+    def _process_command(self, name: bytes, content: bytes) -> None:
+        if self._commands.take(time.monotonic()) > 0:
+            raise MalformedMessage(f"zmtp: more than {CONTROL_FRAMES} commands at once")
+        if name == b"PING":
+            with self._sending:
+                self._connection.settimeout(_SEND_S)
+                self._connection.sendall(zmtp.write_pong(content))
+
+    def _process(self, envelope: Envelope, size: int, deadline: float) -> None:
+        """Receive the payload of a message, and answer it."""
+        with self._sending:
+            self._waiting = envelope
+        with self._answered:
+            self._unanswered = 1
+        try:
+            try:
+                payload = self._read(size, _MESSAGE_S, deadline)
+            except Overloaded as error:
+                answer = _error(error)
             else:
-                key = gr00t.read_token(payload, self._context.limits)
-                self.sessions.show(check(key), key)
-            self.sessions.begin()
-            request = gr00t.read_request(payload, self._context.limits)
-            return gr00t.pack(self._value(request), packed=request.packed)
+                answer = self._answer(envelope, payload)
+        finally:  # before the client has the answer, since another may then have its place
+            with self._answered:
+                self._unanswered = 0
+                self._used = time.monotonic()
+                self._answered.notify_all()
+        self._send(answer)
+        time.sleep(self.sessions.throttled_s())
+
+    def _send(self, answer: bytes) -> None:
+        """Send the answer to the current request, unless it has one."""
+        with self._sending:
+            envelope, self._waiting = self._waiting, None
+            if envelope is not None:
+                self._connection.settimeout(_SEND_S)
+                self._connection.sendall(zmtp.write_message([*envelope, answer]))
+
+    # The messages.
+
+    def _answer(self, envelope: Envelope, payload: memoryview) -> bytes:
+        try:
+            if self._dialect.is_stopping:
+                raise _stopping()
+            if envelope not in _ENVELOPES:
+                self._count_refusal()
+                raise MalformedMessage(
+                    f"gr00t: got an envelope of {len(envelope)} parts, want none or an empty one; connect each client "
+                    f"directly, without a ZeroMQ proxy"
+                )
+            self._identify(payload)
+            admission = self._context.admission
+            admission.hold(len(payload), self._is_robot, 0, self._share)
+            try:
+                self.sessions.begin()
+                request = gr00t.read_request(payload, self._context.limits)
+                return gr00t.pack(self._value(request), packed=request.packed)
+            finally:
+                admission.release(len(payload), self._share)
         except VLAgentsError as error:
-            return gr00t.pack({"error": f"{error.code}: {error}"})
+            return _error(error)
         except Exception:  # noqa: BLE001 - logged, and answered
             return gr00t.pack({"error": internal_error("gr00t")})
+
+    def _identify(self, payload: memoryview) -> None:
+        """Set the sessions' caller by the key of a message; raise an error unless it is valid, or none is needed."""
+        check = self._context.check
+        if isinstance(check, NoKey):
+            self.sessions.show(check, None)
+        else:
+            try:
+                key = self._dialect.read_key(payload, of_client=self.is_client)
+                caller = check(key)
+            except VLAgentsError:
+                self._count_refusal()
+                raise
+            self.sessions.show(caller, key)
+            if isinstance(caller, Caller):
+                self._share = caller.name
+                self._is_robot = self._dialect.config.rank == "robot" and caller.rank != "simulation"
+        if not self.is_client:
+            self._dialect.admit(self)
+        self._reader.set_sender(self._context.admission, self._share, robot=self._is_robot)
+
+    def _count_refusal(self) -> None:
+        """Count a message without a valid key; end the connection after too many."""
+        self._refused += 1
+        if self._refused >= _REFUSALS:
+            self.end()
+        else:
+            time.sleep(_REFUSAL_S)
 
     def _value(self, request: GR00TRequest) -> Any:
         if request.endpoint == "ping":
@@ -152,6 +300,10 @@ class GR00TConnection(GatewayClient):
             "action": (list(mapping.action) or ["action"], list(range(chunk))),
             "language": ([gr00t.TEXT_KEY], [0]),
         }
+
+
+def _error(error: VLAgentsError) -> bytes:
+    return gr00t.pack({"error": f"{error.code}: {error}"})
 
 
 def _stopping() -> PolicyUnavailable:
@@ -192,32 +344,41 @@ class GR00TDialectConfig(PortConfig):
 
 
 class GR00TDialect(PortDialect):
-    """GR00T's protocol; one thread owns the ROUTER socket, and each client has a separate thread."""
+    """GR00T's protocol, with one thread and one session per connection."""
 
     Config = GR00TDialectConfig
     clients = "GR00T"
     summary = (
-        "A session is the client, until it is idle; `reset` begins an episode, and a batch of B is B "
+        "A session is the connection, until it is idle; `reset` begins an episode, and a batch of B is B "
         "sessions. `api_token` is the API key. An error is a map with `error`."
     )
-    requires = ("zmq", "msgpack")
+    requires = ("msgpack",)
     presets = PRESETS
 
     def __init__(self, name: str, config: GR00TDialectConfig, context: GatewayContext) -> None:
         super().__init__(name, config, context)
-        self._clients: GatewayClients[bytes, GR00TConnection] = GatewayClients(context)  # by identity
-        self._looked = float("-inf")  # time of the last check of all clients, s
-        self._answers: queue.SimpleQueue[tuple[Envelope, bytes]] = queue.SimpleQueue()
-        self._bell, self._ring = socket.socketpair()
-        self._ring.setblocking(False)
+        # Bytes of strangers' incomplete messages. One address may take half, which is the largest message.
+        self.of_strangers = Admission(2 * context.limits.body_bytes)
+        self._clients: GatewayClients[int, GR00TConnection] = GatewayClients(context)  # by `id`
+        self._lock = threading.Lock()  # guards the next two fields
+        self._connections: set[GR00TConnection] = set()
+        self._strangers: dict[GR00TConnection, None] = {}  # the connections that are no clients, the oldest first
         self._stopping = threading.Event()  # whether new requests are refused
         self._closing = threading.Event()  # whether all requests are answered
+        self._key_reader = ThreadPoolExecutor(1, "gr00t-keys")
+        self._listener: socket.socket | None = None
         self._thread: threading.Thread | None = None
-        self._strangers: _Strangers | None = None
+
+    @property
+    def is_stopping(self) -> bool:
+        """Whether requests are refused, since the server is stopping."""
+        return self._stopping.is_set()
 
     def serve(self, listener: socket.socket) -> None:
-        require("zmq"), require("msgpack")
+        require("msgpack")
         listener.listen()
+        listener.settimeout(_TICK_S)
+        self._listener = listener
         self._thread = threading.Thread(target=self._run, args=(listener,), name="gr00t", daemon=True)
         self._thread.start()
 
@@ -227,234 +388,82 @@ class GR00TDialect(PortDialect):
     def close(self) -> None:
         self._stopping.set()  # a client of this protocol waits for ever for an answer that does not come
         until = time.monotonic() + _END_S
-        for client in self._clients.end_all():
-            client.thread.join(max(0.0, until - time.monotonic()))
-            for envelope in client.unanswered():
-                error = _stopping()
-                self.answer(envelope, gr00t.pack({"error": f"{error.code}: {error}"}))
+        with self._lock:
+            connections = list(self._connections)
+        for connection in connections:
+            connection.wait_answered(until)
+        for connection in connections:
+            with contextlib.suppress(OSError):  # the client has disconnected
+                connection.refuse_waiting(_stopping())
         self._closing.set()
-        self._wake()
+        if self._listener is not None:
+            shut_down(self._listener)
         if self._thread is not None:
             self._thread.join(_END_S)
-        self._bell.close()
-        self._ring.close()
+        with self._lock:
+            connections = list(self._connections)
+        for connection in connections:
+            connection.end()
+        until = time.monotonic() + _LINGER_S
+        for connection in connections:
+            connection.thread.join(max(0.0, until - time.monotonic()))
+            connection.cut_off("the server is stopping")
+        self._key_reader.shutdown(wait=False)
 
-    def answer(self, envelope: Envelope, message: bytes) -> None:
-        """Send a message to a client, from any thread."""
-        self._answers.put((envelope, message))
-        self._wake()
+    def read_key(self, payload: memoryview, *, of_client: bool) -> str | None:
+        """Return the API key in a message; None if it has none.
 
-    def _wake(self) -> None:
-        with contextlib.suppress(OSError):  # the thread is already being woken, or the dialect is closed
-            self._ring.send(b".")
+        Those of strangers are read on one thread: each thread's heap would keep the memory of the largest message.
+        """
+        if of_client:
+            return gr00t.read_token(payload, self.context.limits)
+        return self._key_reader.submit(gr00t.read_token, payload, self.context.limits).result()
+
+    def admit(self, connection: GR00TConnection) -> None:
+        """Count a connection with a valid key among the clients; raise `PolicyUnavailable` if there are too many."""
+        self._clients.add(id(connection), lambda: connection)
+        connection.is_client = True
+        with self._lock:
+            self._strangers.pop(connection, None)
+
+    def remove(self, connection: GR00TConnection) -> None:
+        """Remove a connection that ends."""
+        self._clients.remove(id(connection))
+        with self._lock:
+            self._strangers.pop(connection, None)
+            self._connections.discard(connection)
 
     def _run(self, listener: socket.socket) -> None:
-        zmq = require("zmq")
-        context = zmq.Context(io_threads=1)
-        router, authenticator = context.socket(zmq.ROUTER), context.socket(zmq.REP)
-        try:
-            router.setsockopt(zmq.LINGER, 0)
-            router.setsockopt(zmq.MAXMSGSIZE, self.context.limits.body_bytes)
-            router.setsockopt(zmq.RCVHWM, WAITING)
-            router.setsockopt(zmq.SNDHWM, WAITING)  # drops replies that a client does not read
-            router.setsockopt(zmq.HEARTBEAT_IVL, _HEARTBEAT_MS)
-            router.setsockopt(zmq.HEARTBEAT_TIMEOUT, 3 * _HEARTBEAT_MS)
-            router.setsockopt(zmq.HANDSHAKE_IVL, _HEARTBEAT_MS)
-            # With an authenticator ZMQ refuses peers with protocols before 3.0, whose dead connections it would retain.
-            authenticator.bind("inproc://zeromq.zap.01")
-            router.setsockopt(zmq.ZAP_DOMAIN, b"gr00t")
-            router.setsockopt(zmq.USE_FD, listener.fileno())
-            host, port = listener.getsockname()[:2]
-            router.bind(f"tcp://[{host}]:{port}" if ":" in host else f"tcp://{host}:{port}")
-            listener.detach()  # ZMQ owns it now and closes it with the ROUTER socket
-            self._strangers = strangers = _Strangers(router, zmq, port, self.context.limits.body_bytes)
-            poller = zmq.Poller()
-            poller.register(strangers.monitor, zmq.POLLIN)
-            poller.register(router, zmq.POLLIN)
-            poller.register(authenticator, zmq.POLLIN)
-            poller.register(self._bell, zmq.POLLIN)
-            while not self._closing.is_set():
-                ready = dict(poller.poll(_STRANGERS_MS if strangers else _TICK_MS))
-                if strangers.monitor in ready:
-                    strangers.note_events()
-                strangers.end_overdue()
-                if self._bell.fileno() in ready:
-                    self._bell.recv(4096)
-                    self._send(router, zmq)
-                if authenticator in ready:  # it accepts every peer, as API keys are in the messages
-                    version, request, *_ = authenticator.recv_multipart()
-                    authenticator.send_multipart([version, request, b"200", b"", b"", b""])
-                if router in ready:
-                    self._receive(router, zmq)
-                # End the sessions of idle clients and of clients whose key is no longer valid, twice a second.
-                now = time.monotonic()
-                if now - self._looked >= _TICK_MS / 1e3:
-                    self._looked = now
-                    self._clients.forget_quiet()
-            self._receive(router, zmq)
-            self._send(router, zmq)
-        except Exception:
-            logger.exception("gr00t: the dialect has failed, and accepts no more clients")
-        finally:
-            listener.close()
-            if self._strangers is not None:
-                self._strangers.close()
-            router.close(linger=_LINGER_MS)
-            authenticator.close()
-            context.destroy(linger=0)
-
-    def _send(self, router: Any, zmq: Any) -> None:
-        while not self._answers.empty():  # no other thread takes from it
-            envelope, message = self._answers.get()
-            with contextlib.suppress(zmq.ZMQError):  # the client is gone, or does not read
-                router.send_multipart([*envelope, message], zmq.NOBLOCK)
-
-    def _receive(self, router: Any, zmq: Any) -> None:
-        for _ in range(64):  # then replies are sent again
-            try:
-                parts = router.recv_multipart(zmq.NOBLOCK, copy=False)
-            except zmq.Again:
-                return
-            except zmq.ZMQError as error:
-                logger.info("gr00t: a message was lost: %s", error)
-                return
-            *envelope_parts, payload = parts
-            descriptor: int = payload.get(zmq.SRCFD)
-            sizes = [len(part) for part in envelope_parts]
-            if not 0 < len(sizes) <= _MOST_PARTS or sum(sizes) > _MOST_PART_BYTES:
-                self._refuse(descriptor)
+        accepting = TokenBucket(_ACCEPTED_PER_S, time.monotonic())
+        checked_at = float("-inf")
+        while not self._closing.is_set():
+            now = time.monotonic()
+            if now - checked_at >= _TICK_S:
+                checked_at = now
+                self._clients.forget_quiet()
+            if (wait_s := accepting.take(now)) > 0:
+                time.sleep(wait_s)
                 continue
-            envelope = tuple(part.bytes for part in envelope_parts)
             try:
-                self._take(envelope, payload, descriptor)
-            except VLAgentsError as error:
-                self.answer(envelope, gr00t.pack({"error": f"{error.code}: {error}"}))
+                connection, _ = listener.accept()
+            except TimeoutError:
+                continue
+            except OSError as error:
+                if not self._closing.is_set():
+                    logger.warning("gr00t: cannot accept a client: %s", error)
+                    time.sleep(0.1)  # other connections must end first if descriptors are exhausted
+                continue
+            self._add(connection)
+        listener.close()
 
-    def _take(self, envelope: Envelope, payload: Any, descriptor: int) -> None:
-        """Pass a message to its client, which is created once a message of its connection has a valid key."""
-        if self._stopping.is_set():
-            raise _stopping()
-        identity, *added = envelope
-        if added not in _ENVELOPES:
-            self._refuse(descriptor)
-            raise MalformedMessage(
-                f"gr00t: got an envelope of {len(added)} parts, want none or an empty one; connect each client "
-                f"directly, without a ZeroMQ proxy"
-            )
-        client = self._clients.get(identity)
-        if client is None or (self._strangers is not None and self._strangers.includes(descriptor)):
-            self._require_key(payload.buffer, descriptor)
-        if client is None:
-            client = self._clients.add(identity, lambda: GR00TConnection(self.context, self.mapping, self.answer))
-        if not client.put(envelope, payload.bytes):
-            raise MalformedMessage("wait for the answer before the next request")
-
-    def _require_key(self, payload: memoryview, descriptor: int) -> None:
-        """Raise an error unless a message has a valid key, or needs none; its connection is then no stranger."""
-        check = self.context.check
-        if not isinstance(check, NoKey):
-            try:
-                check(gr00t.read_token(payload, self.context.limits))
-            except VLAgentsError:
-                self._refuse(descriptor)
-                raise
-        if self._strangers is not None:
-            self._strangers.admit(descriptor)
-
-    def _refuse(self, descriptor: int) -> None:
-        if self._strangers is not None:
-            self._strangers.refuse(descriptor)
-
-
-class _Strangers:
-    """The connections without a valid key so far; limits their number, their duration and their bytes.
-
-    ZeroMQ buffers a message of any peer until it is complete, with one limit for all peers, and the key is in the
-    message. ZeroMQ reports the descriptor of each connection; shutting down a duplicate ends the connection.
-    """
-
-    def __init__(self, router: Any, zmq: Any, port: int, most_bytes: int) -> None:
-        """Monitor connections; `most_bytes` limits the bytes of all these connections together, and of one message."""
-        self.monitor = router.get_monitor_socket(zmq.EVENT_ACCEPTED | zmq.EVENT_DISCONNECTED)
-        self._router, self._zmq = router, zmq
-        self._port, self._most_bytes = port, most_bytes
-        self._since: dict[int, tuple[socket.socket, float]] = {}  # by the descriptor in ZeroMQ, oldest first
-        self._refused: dict[int, int] = {}  # number of refused messages, by descriptor
-
-    def __len__(self) -> int:
-        return len(self._since)
-
-    def note_events(self) -> None:
-        """Add the connections that ZeroMQ has accepted, and drop those that have ended."""
-        parse = require("zmq.utils.monitor").parse_monitor_message
-        while self.monitor.poll(0):
-            event = parse(self.monitor.recv_multipart())
-            self._drop(event["value"])
-            if event["event"] == self._zmq.EVENT_ACCEPTED:
-                self._add(event["value"])
-
-    def includes(self, descriptor: int) -> bool:
-        """Return whether no message of a connection has had a valid key, or a later one had none."""
-        return descriptor in self._since
-
-    def admit(self, descriptor: int) -> None:
-        """Drop a connection: one of its messages has a valid key."""
-        self._drop(descriptor)
-
-    def refuse(self, descriptor: int) -> None:
-        """Count a refused message of a connection, and close the connection after too many."""
-        if descriptor not in self._since:
-            self._add(descriptor)
-        self._refused[descriptor] = self._refused.get(descriptor, 0) + 1
-        if self._refused[descriptor] >= _REFUSALS and descriptor in self._since:
-            self._end(descriptor, f"{_REFUSALS} messages without a valid key")
-
-    def end_overdue(self) -> None:
-        """End connections that take too long, and the largest while all are too large."""
-        late = time.monotonic() - _STRANGER_S
-        sizes = {one: _received(connection) for one, (connection, _) in self._since.items()}
-        for descriptor, (_, since) in list(self._since.items()):
-            if since < late:
-                self._end(descriptor, "no message with a valid key in time")
-                del sizes[descriptor]
-        while sum(sizes.values()) > self._most_bytes:
-            largest = max(sizes, key=sizes.__getitem__)
-            self._end(largest, f"{sizes.pop(largest)} bytes without a valid key")
-
-    def close(self) -> None:
-        """Drop all connections, which end with the ROUTER socket."""
-        for descriptor in list(self._since):
-            self._drop(descriptor)
-        self._router.disable_monitor()
-
-    def _add(self, descriptor: int) -> None:
-        try:
-            connection = socket.socket(fileno=os.dup(descriptor))
-        except OSError:  # the connection has already ended
-            return
-        if connection.family not in (socket.AF_INET, socket.AF_INET6) or connection.getsockname()[1] != self._port:
-            connection.close()  # it has ended, and its descriptor belongs to another file
-            return
-        if len(self._since) >= _STRANGERS:
-            self._end(next(iter(self._since)), f"{_STRANGERS} connections are without a valid key")
-        self._since[descriptor] = connection, time.monotonic()
-
-    def _end(self, descriptor: int, reason: str) -> None:
-        logger.info("gr00t: a connection is closed: %s", reason)
-        with contextlib.suppress(OSError):  # the client has already closed it
-            self._since[descriptor][0].shutdown(socket.SHUT_RDWR)
-        self._drop(descriptor)
-
-    def _drop(self, descriptor: int) -> None:
-        self._refused.pop(descriptor, None)
-        if (known := self._since.pop(descriptor, None)) is not None:
-            known[0].close()
-
-
-def _received(connection: socket.socket) -> int:
-    try:
-        info = connection.getsockopt(socket.IPPROTO_TCP, socket.TCP_INFO, _RECEIVED_AT + _RECEIVED.size)
-    except OSError:  # the connection has ended
-        return 0
-    (size,) = _RECEIVED.unpack_from(info, _RECEIVED_AT)
-    return int(size)
+    def _add(self, connection: socket.socket) -> None:
+        client = GR00TConnection(self, connection)
+        with self._lock:
+            oldest = next(iter(self._strangers)) if len(self._strangers) >= _STRANGERS else None
+            if oldest is not None:
+                del self._strangers[oldest]
+            self._strangers[client] = None
+            self._connections.add(client)
+        if oldest is not None:
+            oldest.cut_off(f"{_STRANGERS} connections are without a valid key")
+        client.thread.start()

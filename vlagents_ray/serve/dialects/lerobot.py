@@ -284,7 +284,9 @@ class LeRobotDialect(PortDialect):
     def _observe(self, parts: Iterator[bytes], context: Any) -> None:
         with self._request(context) as client:
             robot = self.config.rank == "robot"
-            admission = MessageAdmission(self.context.admission, self.context.limits, None, robot=robot, inline=False)
+            admission = MessageAdmission(
+                self.context.admission, self.context.limits, None, robot=robot, inline=False, key=_share_of(context)
+            )
             self._uploads[context] = time.monotonic()
             try:
                 data = _joined(parts, admission)
@@ -317,6 +319,12 @@ class LeRobotDialect(PortDialect):
 
 def _stopping() -> PolicyUnavailable:
     return PolicyUnavailable("the server is stopping; connect again")
+
+
+def _share_of(context: Any) -> str:
+    """Return the name under which a client without a key has a share of the bytes in flight: that of its address."""
+    peer: str = context.peer()  # with the port
+    return f"address {peer.rpartition(':')[0]}"
 
 
 def _joined(messages: Iterator[bytes], admission: MessageAdmission) -> bytes:

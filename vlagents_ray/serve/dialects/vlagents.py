@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import importlib.metadata
 import logging
 import os
@@ -21,7 +20,6 @@ from vlagents_ray.errors import (
     InvalidInput,
     InvalidObservation,
     MalformedMessage,
-    MessageTooLarge,
     PolicyUnavailable,
     VLAgentsError,
     shown,
@@ -30,6 +28,7 @@ from vlagents_ray.interface import Obs
 from vlagents_ray.serve.access.api_keys import NoKey
 from vlagents_ray.serve.config.dialects import DialectConfig, KeylessPortConfig
 from vlagents_ray.serve.dialects.base import GatewayContext, PortDialect
+from vlagents_ray.serve.dialects.client_reader import ClientReader, share_of, shut_down
 from vlagents_ray.serve.dialects.gateway_sessions import GatewaySessions, internal_error
 from vlagents_ray.serve.engine.admission import MessageAdmission
 from vlagents_ray.wire import json_numpy, rpyc, vlagents
@@ -55,6 +54,9 @@ class VlagentsConnection:
         self._dialect, self._connection = dialect, connection
         self._session = GatewaySessions(context.connect, context.contract)
         self._session.show(NoKey.OPEN, None)  # the protocol has no key, and the deployment accepted that
+        robot = dialect.config.rank == "robot"
+        self._share = share_of(connection)  # whose share of the bytes in flight its messages take
+        self._reader = ClientReader(connection, context.admission, robot=robot)
         self._segments = SharedMemory(same_machine=dialect.config.shared_memory and _is_same_machine(connection))
         self._sending = threading.Lock()
         self._unanswered: int | None = None  # sequence number of the request that is being processed
@@ -66,7 +68,7 @@ class VlagentsConnection:
             while not self._dialect.closing and (frame := self._receive()) is not None:
                 if not self._handle(*frame):
                     return
-        except (InvalidInput, OSError, ValueError) as error:
+        except (VLAgentsError, OSError, ValueError) as error:
             logger.info("vlagents: disconnected a client: %s", error)
         except Exception:
             logger.exception("vlagents: disconnected a client")
@@ -168,7 +170,16 @@ class VlagentsConnection:
         return json_numpy.dumps(info)
 
     def _admission(self, text: str | bytes) -> MessageAdmission:
-        return MessageAdmission(self._context.admission, self._context.limits, None, len(text), inline=False)
+        robot = self._dialect.config.rank == "robot"
+        return MessageAdmission(
+            self._context.admission,
+            self._context.limits,
+            None,
+            len(text),
+            robot=robot,
+            inline=False,
+            key=self._share,
+        )
 
     def _ours(self, obs: Obs) -> Obs:
         """Return the observation under the policy's names, converted if the deployment has a mapping."""
@@ -184,30 +195,15 @@ class VlagentsConnection:
 
     def _receive(self) -> tuple[bytearray, bool] | None:
         """Receive the next message, and whether it is compressed; None if the client disconnected before it."""
-        header = self._read(rpyc.HEADER.size, self._context.idle_s, time.monotonic() + self._context.idle_s + _FRAME_S)
+        header = self._reader.read(
+            rpyc.HEADER.size, self._context.idle_s, time.monotonic() + self._context.idle_s + _FRAME_S
+        )
         if header is None:
             return None
-        length, compressed = rpyc.read_header(header, self._context.limits.body_bytes)
-        if (body := self._read(length, _FRAME_S, time.monotonic() + _FRAME_S)) is None:
+        length, compressed = rpyc.read_header(bytes(header), self._context.limits.body_bytes)
+        if (body := self._reader.read(length, _FRAME_S, time.monotonic() + _FRAME_S)) is None:
             raise ConnectionResetError("the client disconnected within a message")
-        return body, compressed
-
-    def _read(self, length: int, silent_s: float, deadline: float) -> bytearray | None:
-        """Receive `length` bytes, allocating memory as they arrive; return None if the client disconnected before them.
-
-        At most `silent_s` s pass between two parts; the `deadline` of the last is in s, of `time.monotonic()`.
-        """
-        data = bytearray()
-        while len(data) < length:
-            if (left_s := min(silent_s, deadline - time.monotonic())) <= 0:
-                raise MessageTooLarge("a message took longer than a client may take")
-            self._connection.settimeout(left_s)
-            if not (more := self._connection.recv(min(length - len(data), 2**20))):
-                if data:
-                    raise ConnectionResetError("the client disconnected within a message")
-                return None
-            data += more
-        return data
+        return bytearray(body), compressed
 
     def _send(self, frame: bytes) -> None:
         self._connection.settimeout(_SEND_S)
@@ -252,12 +248,6 @@ def _is_same_machine(connection: socket.socket) -> bool:
         return bool(connection.getpeername()[0] == connection.getsockname()[0])
     except OSError:  # the client is already gone
         return False
-
-
-def shut_down(connection: socket.socket, directions: int = socket.SHUT_RDWR) -> None:
-    """Shut a connection down, in both directions by default, which wakes the thread that reads from it."""
-    with contextlib.suppress(OSError):
-        connection.shutdown(directions)
 
 
 # Access by name to the shared memory of a client on this machine.
