@@ -20,6 +20,7 @@ from vlagents_ray.protocol.values import require_obs
 
 LONGEST_S = 20.0  # of CPU time, for one mistake
 POLICIES = """
+import os
 import numpy as np
 from vlagents_ray import Act, ActionSpec, Agent, Contract, StateSpec
 
@@ -63,6 +64,11 @@ class Text(Base):
 class Ends(Base):
     def act(self, obs):
         raise SystemExit(5)
+
+
+class EndsItsProcess(Base):
+    def act(self, obs):
+        os._exit(0)
 
 
 class DoesNotLoad(Base):
@@ -188,6 +194,7 @@ EPISODES = {
     "NotFinite": ["NaN or infinity"],
     "Text": ["str", "Act"],
     "Ends": ["SystemExit"],
+    "EndsItsProcess": ["os._exit(0)", "raise an exception instead", "own.py:"],
     "DoesNotLoad": ["weights.bin", "own.py:"],
 }
 

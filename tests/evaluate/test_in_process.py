@@ -9,6 +9,7 @@ import sqlite3
 import subprocess
 import sys
 import threading
+import time
 from collections.abc import Callable, Iterator
 from contextlib import closing
 from pathlib import Path
@@ -18,11 +19,12 @@ import pytest
 from eval_fakes import DRIFTING_LINE, LINE, OTHER_LINE, ToZero
 from in_process_evaluation import flat_config
 
+from vlagents_ray import Act, Obs
 from vlagents_ray.errors import ClusterLost, ConfigError, EnvFailed
 from vlagents_ray.evaluate import EvalConfig, EvaluationInterrupted, Summary, evaluate, run
 from vlagents_ray.evaluate.episode.failures import Failure
 from vlagents_ray.evaluate.plan.jobs import Job
-from vlagents_ray.evaluate.workers import base, in_process
+from vlagents_ray.evaluate.workers import base, in_process, rollout
 from vlagents_ray.evaluate.workers.in_process import InProcessWorkers
 from vlagents_ray.evaluate.workers.rollout import Report
 
@@ -184,3 +186,36 @@ def test_results_are_read_without_ray(config: Callable[..., EvalConfig]) -> None
     told = subprocess.run(command, check=False, capture_output=True, text=True, timeout=60)
     assert told.returncode == 0, told.stderr
     assert told.stdout.strip() == str(summary.total.episodes)
+
+
+class Slow(ToZero):
+    """Each action takes longer than the limit."""
+
+    def act(self, obs: Obs) -> Act:
+        time.sleep(0.5)
+        return super().act(obs)
+
+
+def test_a_call_that_exceeds_its_limit_is_reported_with_its_line(
+    config: Config, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(in_process, "_LOOK_S", 0.01)
+    monkeypatch.setattr(rollout, "LONG_S", 0.01)
+    evaluate(config(episodes=1, workers=0, policy_timeout_s=0.1), agent_factory=Slow)
+    [first, *_] = [record.getMessage() for record in caplog.records if "may hang" in record.getMessage()]
+    assert "policy act after 0 steps has taken longer than 0.1 s" in first
+    assert "time.sleep(0.5)" in first
+
+
+def test_a_policy_that_ends_the_process_fails_its_episode_only(config: Config) -> None:
+    before = os._exit
+
+    class Ending(ToZero):
+        def act(self, obs: Obs) -> Act:
+            os._exit(0)
+
+    summary = evaluate(config(episodes=1, workers=0), agent_factory=Ending)
+    errors = [one.result.error or "" for cell in summary.results.cells for one in cell.episodes]
+    assert errors
+    assert all("os._exit(0) was called (test_in_process.py:" in error for error in errors)
+    assert os._exit is before

@@ -35,7 +35,7 @@ def main() -> None:
 
 
 def _end_at_once(_number: int, _frame: FrameType | None) -> None:
-    os.write(2, b"error interrupted\n")
+    os.write(2, b"error interrupted before the command began; nothing was started or written\n")
     os._exit(130)
 
 

@@ -91,6 +91,10 @@ def errors(*settings: type[BaseModel]) -> Iterator[None]:
         raise typer.Exit(1) from error
     except VLAgentsError as error:
         fail(f"{type(error).__name__}: {error}", 1)
+    except OSError as error:
+        if error.filename is None:
+            raise
+        fail(f"{error.filename}: cannot be used: {error.strerror}; choose another path, or change its permissions", 1)
     except KeyboardInterrupt as error:
         fail(str(error) or "interrupted", 130)
 
@@ -108,7 +112,9 @@ def say_error(message: str, console: Console | None = None) -> None:
 
 
 def require_folder_of(file: Path) -> None:
-    """Raise `ConfigError` unless the folder of a file that a command is about to write exists."""
+    """Raise `ConfigError` unless a command can write this file: its folder exists, and it is not a folder itself."""
+    if file.is_dir():
+        raise ConfigError(f"{file}: expected a file, got a folder; add the name of a file")
     if not file.absolute().parent.is_dir():
         raise ConfigError(
             f"{file}: expected a file in a folder that exists, got no folder {file.parent}; make it first"

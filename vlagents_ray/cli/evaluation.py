@@ -129,7 +129,12 @@ def run_evaluation(
     if live is not None and config.workers is None:  # the page also shows the sessions of replicas
         config = config.model_copy(update={"workers": 1})
     with contextlib.ExitStack() as stack:
-        ready, agents = stack.enter_context(served(config, address, replica_per_gpu=replica_per_gpu))
+        try:
+            ready, agents = stack.enter_context(served(config, address, replica_per_gpu=replica_per_gpu))
+        except KeyboardInterrupt as error:
+            raise KeyboardInterrupt(
+                "interrupted while Ray and the policies started; no episode began: repeat the command"
+            ) from error
         progress = stack.enter_context(shown_progress(ready, live))
         summary = evaluate_and_print(ready, progress, end_at, agents)
     require_results(ready, summary)

@@ -2,6 +2,9 @@
 
 With --env a simulation is driven: by a policy, by an operator, or by a policy that an operator corrects.
 
+The server's API key is read from the variable VLAGENTS_RAY_API_KEY, and the file of your own CA from
+SSL_CERT_FILE.
+
 `vlagents-ray robot check ROBOT` checks a robot before a policy moves it.
 
 Exit status: 0 if every tick had an action of the policy, 1 if not, 3 if fewer than half had, 2 if it could not run.
@@ -22,11 +25,13 @@ from typing import Any, get_args
 from vlagents_ray.chunking.buffer import ENSEMBLE, MERGES, Mode
 from vlagents_ray.chunking.control import Control, Leader
 from vlagents_ray.chunking.player import ChunkPlayer, PlayerSettings
+from vlagents_ray.cli.arguments import number, one_of, parse_all
 from vlagents_ray.client.agent import RemoteAgent
 from vlagents_ray.client.commands import CommandInbox
 from vlagents_ray.contract import Contract
 from vlagents_ray.errors import ConfigError, VLAgentsError, printable
 from vlagents_ray.interface import Agent
+from vlagents_ray.naming import did_you_mean
 from vlagents_ray.robot.fit import Fit, Trained
 from vlagents_ray.robot.limits import Limits
 from vlagents_ray.robot.loop import (
@@ -90,7 +95,7 @@ def main(arguments: Sequence[str]) -> int:
 def parse(arguments: Sequence[str]) -> argparse.Namespace:
     """Parse the arguments; the process ends with status 2 if they are inconsistent."""
     parser, of_robot, of_env = command_parser()
-    options = parser.parse_args(arguments)
+    options = parse_all(parser, arguments)
     in_env = options.env is not None
     refused = of_robot if in_env else of_env
     given = [one.option_strings[0] for one in refused if getattr(options, one.dest) != one.default]
@@ -100,6 +105,8 @@ def parse(arguments: Sequence[str]) -> argparse.Namespace:
         parser.error("got neither a URL nor --env, want one of them")
     if options.ros is not None and options.robot is not None:
         parser.error("got --robot besides --ros, want one of them")
+    if options.robot_set and options.robot is None:
+        parser.error("got --robot-set without --robot; name the robot's class with --robot MODULE:CLASS")
     if options.mode is None:
         options.mode = "open_loop" if in_env else "async"
     if options.mode != "async" and (options.merge != "newest" or options.rtc):
@@ -245,7 +252,10 @@ def _leader(
             ) from error
         return stack.enter_context(leader) if isinstance(leader, contextlib.AbstractContextManager) else leader
     if options.leader not in _DEVICES:
-        raise ConfigError(f"--leader: got {options.leader!r}, want one of {list(_DEVICES)}, or MODULE:CLASS")
+        raise ConfigError(
+            f"--leader: got {options.leader!r}, want one of {list(_DEVICES)}, or MODULE:CLASS"
+            f"{did_you_mean(options.leader, _DEVICES)}"
+        )
     device = _DEVICES[options.leader]()
     stack.enter_context(device)
     if isinstance(device, Keyboard):
@@ -346,24 +356,6 @@ def _restarting(
         yield has_terminal
 
 
-def _number(
-    kind: type[float] | type[int] = float, *, least: float = 0, above: bool = False, most: float = 1e9
-) -> Callable[[str], float]:
-    """Return a function with which argparse reads a number not below `least`, or above it, and up to `most`."""
-
-    def read(text: str) -> float:
-        with contextlib.suppress(ValueError):
-            value = kind(text)
-            if (value > least or (value == least and not above)) and value > most:
-                raise argparse.ArgumentTypeError(f"got {text!r}, want at most {most:g}")
-            if value > least or (value == least and not above):
-                return value
-        what = "a whole number" if kind is int else "a number"
-        raise argparse.ArgumentTypeError(f"got {text!r}, want {what} {'above' if above else 'from'} {least:g}")
-
-    return read
-
-
 def command_parser() -> tuple[argparse.ArgumentParser, list[argparse.Action], list[argparse.Action]]:
     """Return the parser, the options that are refused with --env, and those that need it."""
     parser = argparse.ArgumentParser(
@@ -374,8 +366,8 @@ def command_parser() -> tuple[argparse.ArgumentParser, list[argparse.Action], li
     of_robot: list[argparse.Action] = []
     of_env: list[argparse.Action] = []
     add = parser.add_argument
-    seconds = _number(above=True)
-    rows = _number(int, least=1)
+    seconds = number(above=True)
+    rows = number(int, least=1)
 
     def real(*names: str, **settings: Any) -> None:
         of_robot.append(groups[0].add_argument(*names, **settings))
@@ -384,7 +376,7 @@ def command_parser() -> tuple[argparse.ArgumentParser, list[argparse.Action], li
         of_env.append(groups[1].add_argument(*names, **settings))
 
     add("policy", nargs="?", help="URL of its server; with --env also a registered policy, 'module:Class', or nothing")
-    add("--hz", type=_number(above=True, most=_MOST_HZ), help=f"control rate (default: {_HZ:g}, or the environment's)")
+    add("--hz", type=number(above=True, most=_MOST_HZ), help=f"control rate (default: {_HZ:g}, or the environment's)")
     real("--seconds", type=seconds, default=60.0, help="how long (%(default)s)")
     real("--instruction", help="the task in words")
     real("--robot", metavar="MODULE:CLASS", help="your class, lerobot:TYPE or mujoco:ARM; default: a simulated one")
@@ -392,25 +384,43 @@ def command_parser() -> tuple[argparse.ArgumentParser, list[argparse.Action], li
     real("--ros", metavar="FILE", help="a robot behind topics of ROS 2, from this file; see docs/ros.md")
     add("--leader", metavar="LEADER", help="device for taking over: keyboard, spacemouse, or your MODULE:CLASS")
     add("--step", type=seconds, help="what a key or axis of these adds to a number of the action at a tick")
-    add("--mode", choices=get_args(Mode), help="see PlayerSettings (default: async; with --env open_loop)")
+    add(
+        "--mode",
+        **one_of(*get_args(Mode)),
+        help="see PlayerSettings (default: async; with --env open_loop)",
+    )
     add("--execute", type=rows, metavar="N", help="rows of a chunk to execute before asking again")
     real("--horizon", type=rows, metavar="N", help="rows of a chunk that may be executed at all")
     real("--max-age-s", type=seconds, metavar="S", help="largest age of the observation of an executed action")
-    real("--merge", choices=(*MERGES, ENSEMBLE), default="newest", help="how overlapping chunks merge (%(default)s)")
+    real(
+        "--merge",
+        **one_of(*MERGES, ENSEMBLE),
+        default="newest",
+        help="how overlapping chunks merge (%(default)s)",
+    )
     real("--rtc", action="store_true", help="real-time chunking: send the rest of the plan, and the delay")
-    real("--deadline-ms", type=_number(), help=f"wait of a tick for an action (async: 0, else {WAIT_S * 1e3:.0f})")
-    real("--safe", choices=("auto", "hold", "zero"), default="auto", help="at a tick without an action (%(default)s)")
-    add("--max-step", type=_number(), help="largest change of a number of the action from one tick to the next")
+    real("--deadline-ms", type=number(), help=f"wait of a tick for an action (async: 0, else {WAIT_S * 1e3:.0f})")
+    real(
+        "--safe",
+        **one_of("auto", "hold", "zero"),
+        default="auto",
+        help="at a tick without an action (%(default)s)",
+    )
+    add("--max-step", type=number(), help="largest change of a number of the action from one tick to the next")
     real("--measure", metavar="PART", help="part of the state with the measured pose, for --max-step, e.g. joints")
     add("--limits", metavar="PATH", help="limits of motion: .yaml, .json, .urdf or dataset; see docs/control_loop.md")
-    add("--soft-start-s", type=_number(), default=SOFT_START_S, help="in which these rise from half (%(default)s)")
+    add("--soft-start-s", type=number(), default=SOFT_START_S, help="in which these rise from half (%(default)s)")
     trained = "file with statistics of the training, which arm and first chunk must fit (default: the server's, if any)"
     real("--trained-on", metavar="FILE", help=trained)
     real("--accept-misfit", action="store_true", help="move although they do not fit; the log shows it")
-    real("--restart", choices=get_args(Restart), help="after a stop: by Enter, C or SIGUSR1; if simulated: auto")
+    real(
+        "--restart",
+        **one_of(*get_args(Restart)),
+        help="after a stop: by Enter, C or SIGUSR1; if simulated: auto",
+    )
     real("--silent-s", type=seconds, default=2.0, help="stop the robot if the server is silent this long (%(default)s)")
     real("--timeout-s", type=seconds, default=10.0, help="time after which a request is given up (%(default)s)")
-    real("--transport", choices=("auto", "shm", "websocket", "http"), default="auto", help="(%(default)s)")
+    real("--transport", **one_of("auto", "shm", "websocket", "http"), default="auto", help="(%(default)s)")
     add("--record", metavar="DIR", help="record a LeRobotDataset v3.0 there; needs the extra 'record'")
     add("--rerun", metavar="DIR", help="write a .rrd file there for Rerun, or 'live': show the run in its viewer")
     real("--operate", action="store_true", help="obey the server's live page: pause, stop, success, failure")
@@ -420,5 +430,5 @@ def command_parser() -> tuple[argparse.ArgumentParser, list[argparse.Action], li
     simulated("--env-set", **settings, help="an option of the environment: width=256")
     simulated("--set", **settings, help="a setting of the policy, repeatable")
     simulated("--episodes", type=rows, default=10, metavar="N", help="how many (%(default)s)")
-    simulated("--seed", type=int, default=0, help="of the first episode; the others count on (%(default)s)")
+    simulated("--seed", type=number(int), default=0, help="of the first episode; the others count on (%(default)s)")
     return parser, of_robot, of_env

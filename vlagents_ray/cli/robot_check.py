@@ -18,6 +18,7 @@ from collections.abc import Sequence
 from dataclasses import asdict, replace
 from functools import partial
 
+from vlagents_ray.cli.arguments import number, parse_all
 from vlagents_ray.client.agent import RemoteAgent
 from vlagents_ray.errors import VLAgentsError
 from vlagents_ray.robot.check import Operator, RobotReport, examine
@@ -31,7 +32,7 @@ UNDECLARED = 3  # exit status
 def main(arguments: Sequence[str]) -> int:
     """Run the command, and return its exit status."""
     parser = command_parser()
-    options = parser.parse_args(arguments)
+    options = parse_all(parser, arguments)
     if (options.robot is None) == (options.ros is None):
         parser.error("want a robot by name, or one behind topics of ROS 2 (--ros FILE)")
     try:
@@ -85,8 +86,13 @@ def command_parser() -> argparse.ArgumentParser:
     add("--robot-set", metavar="KEY=VALUE", action="append", default=[], help="an argument of the robot, repeatable")
     add("--move", action="store_true", help="make small moves, each after a question at the terminal")
     add("--policy", metavar="URL", help="check by the contract of the policy of this server, not by the robot's own")
-    add("--hz", type=float, help="control rate (default: the contract's, or 50)")
-    add("--latency-ms", type=float, default=400.0, help="longest time from command to motion (%(default)s)")
+    add("--hz", type=number(above=True, most=10_000.0), help="control rate (default: the contract's, or 50)")
+    add(
+        "--latency-ms",
+        type=number(most=60_000.0),
+        default=400.0,
+        help="longest time from command to motion (%(default)s)",
+    )
     add("--out", metavar="FILE", help="write the report with pictures as an HTML page")
     add("--json", action="store_true", help="as JSON, for programs")
     return parser

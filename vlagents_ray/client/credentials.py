@@ -104,7 +104,10 @@ def tls_failure(url: str, error: ssl.SSLError) -> VLAgentsError:
     if isinstance(error, (ssl.SSLEOFError, ssl.SSLZeroReturnError)):
         return ConnectionLost(f"{url}: the connection ended ({error}); does the server speak TLS at this port?")
     if isinstance(error, ssl.SSLCertVerificationError):
-        cure = "if the server's certificate is signed by a CA of your own, give its file as ca=, or in SSL_CERT_FILE"
+        cure = (
+            "if the server's certificate is signed by a CA of your own, give the file of the CA's certificate, not of "
+            "the server's, as ca=, or in SSL_CERT_FILE"
+        )
         if error.verify_code in _OTHER_NAMES:
             cure = "write the URL with a name that the certificate has, or make a certificate with this name"
         return ConfigError(f"{url}: the server's certificate is not to be trusted: {error.verify_message}; {cure}")

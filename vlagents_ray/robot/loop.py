@@ -24,6 +24,7 @@ from vlagents_ray.client.commands import CommandInbox
 from vlagents_ray.contract import Contract, require_match
 from vlagents_ray.errors import ConfigError, InvalidAction, VLAgentsError
 from vlagents_ray.interface import CAPTURED, CAUSE, INTERVENTION, PLANNED, SAFE, SILENT, WANTED, Act, Agent, Obs
+from vlagents_ray.naming import did_you_mean
 from vlagents_ray.robot.fit import Fit, Trained
 from vlagents_ray.robot.limits import Limits
 from vlagents_ray.robot.pacing import KEPT_TICKS, Pacer, jitter, undisturbed
@@ -126,16 +127,20 @@ def import_class(option: str, name: str, methods: Sequence[str] = ()) -> Any:
     """
     module, colon, attribute = name.partition(":")
     if not colon:
-        raise ConfigError(f"{option}: got {name!r}, want module:Class")
+        raise ConfigError(f"{option}: got {name!r}, want module:Class, as in my_arm:MyArm")
     try:
-        found = getattr(importlib.import_module(module), attribute)
-    except (ImportError, AttributeError, ValueError) as error:
+        imported = importlib.import_module(module)
+    except (ImportError, ValueError) as error:
         raise ConfigError(
             f"{option} {name}: {error}; go to the folder of its module ({os.getcwd()} is this one), add that to "
             f"PYTHONPATH, or install it"
         ) from error
     except Exception as error:  # whatever the module raises, a syntax error among them
         raise ConfigError(f"{option} {name}: {type(error).__name__}: {error}; correct the module {module!r}") from error
+    if (found := getattr(imported, attribute, None)) is None:
+        public = [known for known in vars(imported) if not known.startswith("_")]
+        guess = did_you_mean(attribute, public) or "; write the name of a class in it"
+        raise ConfigError(f"{option} {name}: module {module!r} has no {attribute!r}{guess}")
     if missing := [method for method in methods if not callable(getattr(found, method, None))]:
         raise ConfigError(f"{option} {name}: lacks {', '.join(missing)}; want a class with {', '.join(methods)}")
     return found

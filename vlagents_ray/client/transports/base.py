@@ -57,7 +57,10 @@ class Transport(Protocol):
 
 
 class ConnectReport:
-    """Logs once, after 2 s of failing to connect, that a server is not ready and that the client retries."""
+    """Logs once, after 2 s of failing to connect, that a server is not ready and that the client retries.
+
+    That the host's name is unknown is logged at once: it is most often misspelt, but a container's name may come later.
+    """
 
     def __init__(self, url: str, timeout_s: float) -> None:
         """Begin; the attempts to connect last for `timeout_s` in total."""
@@ -69,7 +72,8 @@ class ConnectReport:
         """Record that an attempt failed and will be repeated."""
         waited_s = time.monotonic() - self._begun
         left_s = self._timeout_s - waited_s
-        if not self._logged and waited_s >= _SILENT_S and left_s > 0:
+        is_due = waited_s >= _SILENT_S or isinstance(error.__cause__, socket.gaierror)
+        if not self._logged and is_due and left_s > 0:
             self._logged = True
             logger.warning("%s: not ready; trying again for up to %.0f s (%s)", self._url, left_s, error)
 

@@ -176,8 +176,8 @@ class HttpTransport:
 
 def no_replica(url: str, error: Exception) -> NoReplica:
     """Return the error of a client that cannot connect."""
-    if isinstance(error, socket.gaierror) and error.errno == socket.EAI_NONAME:
-        return NoReplica(f"{url}: there is no host of this name ({error}); is it spelt right?")
+    if isinstance(error, socket.gaierror):
+        return NoReplica(f"{url}: there is no host of this name ({error}); correct the name, or write its IP address")
     return NoReplica(f"{url}: cannot connect ({error}); is it running?")
 
 

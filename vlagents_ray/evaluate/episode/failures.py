@@ -24,6 +24,17 @@ from vlagents_ray.interface import Obs
 from vlagents_ray.validation import check_observation
 
 Cause = Literal["user", "policy", "worker", "operator"]
+# Ends of messages about the policy's server: the likely causes, and how to find the line of a policy.
+_CURES: dict[type[errors.VLAgentsError], str] = {
+    errors.ConnectionLost: (
+        "; if its server was not restarted, the policy ended its own process (os._exit, a crash in C code, or "
+        "exhausted memory): see the log of the server, or find the line in this process with --workers 0"
+    ),
+    errors.DeadlineExceeded: (
+        "; the policy may hang or be too slow: raise policy_timeout_s, or see where it hangs in this process with "
+        "--workers 0"
+    ),
+}
 _USER = (
     errors.ConfigError,
     errors.ContractMismatch,
@@ -75,6 +86,8 @@ def explain(error: errors.VLAgentsError) -> Failure:
     message = str(error)
     if isinstance(error, errors.MissingDependency):
         message += f" (worker's Python: {sys.executable})"
+    if cause == "policy":
+        message += next((cure for kind, cure in _CURES.items() if isinstance(error, kind)), "")
     return Failure(cause, error.code, message, "".join(traceback.format_exception(error)))
 
 

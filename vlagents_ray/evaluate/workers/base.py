@@ -11,6 +11,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from vlagents_ray.errors import ConfigError, PolicyFailed, from_code
+from vlagents_ray.evaluate.episode.episode import Phase
 from vlagents_ray.evaluate.episode.failures import Failure
 from vlagents_ray.evaluate.plan.cases import EvalCase, cells
 from vlagents_ray.evaluate.plan.config import EvalConfig, WorkerConfig
@@ -116,6 +117,16 @@ def dispatch(pool: Workers, queue: JobQueue, begin: Callable[[tuple[Job, ...]], 
             pool.dispatch(worker, jobs)
     while (cell := queue.needs_worker(pool.kinds(), pool.kinds(occupied=False))) is not None and pool.free_slot():
         pool.start(cell)
+
+
+def phase_limits_s(config: EvalConfig) -> dict[Phase, float]:
+    """Return the time limits of the phases of an episode, s; that of other phases is `config.env_timeout_s`."""
+    return {
+        "connect": config.connect_timeout_s + config.policy_timeout_s,
+        "make": config.make_timeout_s,
+        "policy reset": config.policy_timeout_s,
+        "policy act": config.policy_timeout_s,
+    }
 
 
 class FailedAttempts:

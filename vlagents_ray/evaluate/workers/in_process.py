@@ -5,25 +5,34 @@ from __future__ import annotations
 import contextlib
 import functools
 import logging
+import os
+import sys
+import threading
 from collections.abc import Callable, Iterator
+from typing import NoReturn
 
-from vlagents_ray.errors import VLAgentsError
+from vlagents_ray.errors import PolicyFailed, VLAgentsError
 from vlagents_ray.evaluate.artifacts.recorder import RecorderFactory, Recording
 from vlagents_ray.evaluate.plan.cases import EvalCase
 from vlagents_ray.evaluate.plan.config import EvalConfig
 from vlagents_ray.evaluate.plan.jobs import Job
-from vlagents_ray.evaluate.workers.base import VARIABLES, WorkerHandle, Workers
+from vlagents_ray.evaluate.workers.base import VARIABLES, WorkerHandle, Workers, phase_limits_s
 from vlagents_ray.evaluate.workers.rollout import AgentFactory, Report, Rollout
 from vlagents_ray.ray_tools.session import variables
 
 log = logging.getLogger(__name__)
 
 
+_LOOK_S = 1.0  # between two looks at the phase
+_STACK_LINES = 6  # the innermost three calls
+
+
 class InProcessWorkers(Workers):
-    """One worker, which plays while it is waited for. No time limit can end a simulator that hangs."""
+    """One worker, which plays while it is waited for. A call that hangs is reported, but no time limit can end it."""
 
     def __init__(self, config: EvalConfig, agent_factory: AgentFactory, recorders: RecorderFactory = Recording) -> None:
         super().__init__()
+        self._config = config
         self._make = functools.partial(Rollout, config, agent_factory, recorders)
         self._rollout = self._make()
         self._variables = contextlib.ExitStack()
@@ -50,7 +59,8 @@ class InProcessWorkers(Workers):
             jobs, worker.jobs = worker.jobs, ()
             if not jobs:
                 continue
-            reports = self._rollout.run(jobs)
+            with _exits_raised(), _hangs_reported(self._rollout, self._config):
+                reports = self._rollout.run(jobs)
             if reports[0].env is not None:
                 worker.env_place = jobs[0].cell.place
             if any(one.failure is not None and one.failure.cause == "worker" for one in reports):
@@ -64,6 +74,56 @@ class InProcessWorkers(Workers):
             broken.close()
         except VLAgentsError as error:
             log.warning("closing the env: %s", error)
+
+
+@contextlib.contextmanager
+def _exits_raised() -> Iterator[None]:
+    """Let `os._exit`, called by a policy or a simulator in this thread, raise `PolicyFailed`.
+
+    Else it would end the command without a message, and possibly with status 0.
+    """
+    end_process, process, thread = os._exit, os.getpid(), threading.get_ident()
+
+    def end(status: int) -> NoReturn:
+        if (os.getpid(), threading.get_ident()) != (process, thread):  # a child, or the watcher of Ray
+            end_process(status)
+        caller = sys._getframe(1)
+        line = f"{os.path.basename(caller.f_code.co_filename)}:{caller.f_lineno}"
+        raise PolicyFailed(f"os._exit({status}) was called ({line}); raise an exception instead")
+
+    os._exit = end
+    try:
+        yield
+    finally:
+        os._exit = end_process
+
+
+@contextlib.contextmanager
+def _hangs_reported(rollout: Rollout, config: EvalConfig) -> Iterator[None]:
+    """Log the line at which a phase of an episode has exceeded its time limit, once for each such phase."""
+    ended, limits_s = threading.Event(), phase_limits_s(config)
+
+    def watch() -> None:
+        reported = ("", -1)
+        while not ended.wait(_LOOK_S):
+            heartbeat = rollout.progress()
+            limit_s = limits_s.get(heartbeat.phase, config.env_timeout_s)
+            phase = (heartbeat.phase, heartbeat.steps)
+            if heartbeat.phase != "idle" and heartbeat.age_s > limit_s and phase != reported:
+                reported = phase
+                log.warning(
+                    "%s after %d steps has taken longer than %g s, and may hang; Ctrl-C ends the evaluation. It is "
+                    "at\n%s",
+                    *phase,
+                    limit_s,
+                    "\n".join(heartbeat.stack.splitlines()[-_STACK_LINES:]),
+                )
+
+    threading.Thread(target=watch, name="hangs", daemon=True).start()
+    try:
+        yield
+    finally:
+        ended.set()
 
 
 def workers_class(config: EvalConfig, stack: contextlib.ExitStack) -> Callable[..., Workers]:

@@ -22,7 +22,7 @@ from vlagents_ray.evaluate.episode.failures import Failure
 from vlagents_ray.evaluate.plan.cases import EvalCase
 from vlagents_ray.evaluate.plan.config import EvalConfig
 from vlagents_ray.evaluate.plan.jobs import Job
-from vlagents_ray.evaluate.workers.base import SIGNAL_S, WorkerHandle, Workers
+from vlagents_ray.evaluate.workers.base import SIGNAL_S, WorkerHandle, Workers, phase_limits_s
 from vlagents_ray.evaluate.workers.cluster import CapacityMonitor, Placement, runtime_env, strategy, tail_at
 from vlagents_ray.evaluate.workers.rollout import AgentFactory, Heartbeat, Report, Rollout
 from vlagents_ray.ray_tools.head_monitor import HeadMonitor, head_is_gone
@@ -57,12 +57,7 @@ class WorkerPool(Workers):
         self._failed_start = 0.0  # time of the last one
         self._unreachable: dict[str, float] = {}  # by silent host: time until which no request is sent
         self._capacity = CapacityMonitor(config)
-        self._limits_s: dict[Phase, float] = {  # of the phases of an episode; of others, that of the environment
-            "connect": config.connect_timeout_s + config.policy_timeout_s,
-            "make": config.make_timeout_s,
-            "policy reset": config.policy_timeout_s,
-            "policy act": config.policy_timeout_s,
-        }
+        self._limits_s = phase_limits_s(config)
         self._leaving: list[tuple[Any, float]] = []  # actors that are ending, and since when
 
     def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:

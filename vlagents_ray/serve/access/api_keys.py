@@ -57,14 +57,15 @@ class Keys:
     once. After that time all keys are refused until the file can be read, as some may have been revoked.
     """
 
-    def __init__(self, read: Callable[[], str], changed: Callable[[], object]) -> None:
+    def __init__(self, read: Callable[[], str], changed: Callable[[], object], where: str = "keys") -> None:
         """Read the keys.
 
         Args:
             read: Returns the text of the key file.
             changed: Returns an object that differs when the text may have changed.
+            where: The name of the key file in messages.
         """
-        self._read, self._changed = read, changed
+        self._read, self._changed, self._where = read, changed, where
         self._keys: dict[bytes, Key] = {}
         self._buckets: dict[str, TokenBucket] = {}
         self._unread_until: dict[str, float] = {}  # time before which the senders with a key are not read, s
@@ -82,7 +83,7 @@ class Keys:
     def from_file(cls, path: str | Path) -> Keys:
         """Read the keys from a file, which is then checked for changes; raise `ConfigError` if it is not a key file."""
         file = Path(path)
-        return cls(lambda: read_text(file), lambda: _stamp(file))
+        return cls(lambda: read_text(file), lambda: _stamp(file), where=f"keys file {file}")
 
     @classmethod
     def from_text(cls, text: str) -> Keys:
@@ -208,7 +209,7 @@ class Keys:
         self._reminded = now
 
     def _load(self, text: str | None) -> None:
-        self._keys = {} if text is None else {bytes.fromhex(key.sha256): key for key in parse_keys(text)}
+        self._keys = {} if text is None else {bytes.fromhex(key.sha256): key for key in parse_keys(text, self._where)}
 
 
 @dataclass(frozen=True, slots=True)

@@ -70,14 +70,17 @@ class Key:
             raise ConfigError(f"key {self.name!r}: revoked: got {self.revoked!r}, want true or false")
 
 
-def parse_keys(text: str) -> list[Key]:
-    """Return the keys in the text of a key file; raise `ConfigError` if it is invalid or two keys share a name."""
+def parse_keys(text: str, where: str = "keys") -> list[Key]:
+    """Return the keys in the text of a key file, which messages call `where`.
+
+    Raises `ConfigError` if it is invalid or two keys share a name.
+    """
     try:
         document = json.loads(text, object_pairs_hook=without_doubles)
         entries = document["keys"]
     except (ValueError, TypeError, KeyError, RecursionError) as error:
         raise ConfigError(
-            f'keys: expected a JSON document {{"keys": [...]}}, as `vlagents-ray keys new` writes it ({error})'
+            f'{where}: expected a JSON document {{"keys": [...]}}, as `vlagents-ray keys new` writes it ({error})'
         ) from error
     if not isinstance(entries, list):
         raise ConfigError(f"keys: got {type(entries).__name__}, want a list")
@@ -117,7 +120,7 @@ def read_text(file: Path) -> str:
 def read_keys(file: Path) -> list[Key]:
     """Return the keys in a file; an empty list if there is no such file."""
     try:
-        return parse_keys(read_text(file))
+        return parse_keys(read_text(file), f"keys file {file}")
     except ConfigError as error:
         if isinstance(error.__cause__, FileNotFoundError):
             return []

@@ -103,6 +103,8 @@ def serve(
 
 
 def _submit(script: Script, dry_run: bool, parsable: bool) -> None:
+    if script.setup is not None and not script.setup.is_file():
+        raise ConfigError(f"--setup: expected a file of shell lines, got {str(script.setup)!r}, which is none")
     if dry_run:
         typer.echo(script.text(), nl=False)
         return
