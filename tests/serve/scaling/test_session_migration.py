@@ -24,6 +24,7 @@ from vlagents_ray.serve.engine.engine import Engine
 from vlagents_ray.serve.engine.sender import Sender
 from vlagents_ray.serve.scaling import session_migration
 from vlagents_ray.serve.scaling.session_migration import HeldSessions, Peer
+from vlagents_ray.serve.weights import Rest
 
 
 class Counting(Agent):
@@ -156,24 +157,33 @@ def test_a_reset_under_way_is_not_overtaken_by_what_it_ends(replicas: Callable[[
     assert obeys(b) == ("episode 2", 1)
 
 
-def test_a_reset_that_comes_late_ends_no_newer_episode(replicas: Callable[[int], Replicas]) -> None:
+@pytest.mark.parametrize("first", ["the late reset", "the newer episode"])
+def test_a_reset_that_comes_late_ends_no_newer_episode(replicas: Callable[[int], Replicas], first: str) -> None:
+    """The newer episode survives, whichever of the two the replica comes to first; acts of the late one are refused."""
     served = replicas(2)
     cut_off(served)
     a, b = served.engines
-    ask(b, "reset", "other")
-    busy = begin(b, "act", "other", wait=True)
-    Counting.entered.get(timeout=20)
+    b.weights.rest(Rest("sleep", offload=False))  # requests wait
     late = begin(b, "reset", instruction="given up")
     ask(a, "reset", instruction="episode 2")
     state = export(a, "robot-1")
     assert state is not None
-    arrival = threading.Thread(target=b.adopt, args=("robot-1", state))  # when the policy is free
-    arrival.start()
-    Counting.gate.set()
-    assert busy.get(timeout=20).error is None
-    arrival.join(20)
-    assert isinstance(late.get(timeout=20).error, UnknownSession | None)
-    assert obeys(b) == ("episode 2", 1)
+    if first == "the newer episode":
+        b.adopt("robot-1", state)
+        b.weights.rest(Rest("wake"))
+        assert isinstance(late.get(timeout=20).error, UnknownSession)
+    else:
+        with slow(b, "enter") as (begun, release):
+            arrival = threading.Thread(target=b.adopt, args=("robot-1", state))
+            arrival.start()
+            begun.get(timeout=20)
+            b.weights.rest(Rest("wake"))
+            reply = late.get(timeout=20)
+            release.set()
+            arrival.join(20)
+        assert reply.error is None
+        assert isinstance(ask(b, "act", step=reply.step).error, UnknownSession)
+    assert [obeys(b), obeys(b)] == [("episode 2", 1), ("episode 2", 2)]
 
 
 def test_a_session_that_was_closed_does_not_come_back(replicas: Callable[[int], Replicas]) -> None:
