@@ -203,9 +203,14 @@ def boot_id() -> str:
 
 def peer_uid(connection: socket.socket) -> int:
     """Return the user id of the process at the other end of a Unix socket, as the kernel reports it."""
+    return peer_process(connection)[1]
+
+
+def peer_process(connection: socket.socket) -> tuple[int, int]:
+    """Return the process id and the user id at the other end of a Unix socket, as the kernel reports them."""
     credentials = connection.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, struct.calcsize("3i"))
-    uid: int = struct.unpack("3i", credentials)[1]
-    return uid
+    pid, uid, _ = struct.unpack("3i", credentials)
+    return pid, uid
 
 
 def is_loopback(host: str) -> bool:

@@ -359,17 +359,20 @@ def test_only_this_machine_is_reached_and_only_the_same_user_let_in(served: tupl
 
 
 @pytest.mark.skipif(os.getuid() != 0, reason="only root can become another user")
-def test_another_user_is_not_let_in(served: tuple[Engine, ShmServer]) -> None:
+def test_another_user_is_not_let_in(served: tuple[Engine, ShmServer], caplog: pytest.LogCaptureFixture) -> None:
     code = (
         "import os, socket, sys\n"
+        "print(os.getpid())\n"
         "os.setuid(65534)\n"
         "s = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET); s.settimeout(5)\n"
         f"s.connect('\\0{served[1].address.socket}')\n"
         "print(s.recv(10))\n"
     )
     result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=30, check=True)
-    assert result.stdout.strip() == "b''"
+    pid, answer = result.stdout.split()
+    assert answer == "b''"
     assert len(served[0].sessions) == 0
+    assert f"the process {pid} of user 65534 tried to connect" in caplog.text
 
 
 def test_what_could_not_be_sent_keeps_no_memory() -> None:

@@ -28,7 +28,7 @@ import numpy as np
 from vlagents_ray.errors import MalformedMessage, MessageTooLarge, PolicyUnavailable, VLAgentsError
 from vlagents_ray.protocol import shm_layout
 from vlagents_ray.protocol.frames import Decoded, decode_requests, encode_replies
-from vlagents_ray.protocol.messages import OPS, Limits, LocalAddress, Op, Reply, boot_id, peer_uid
+from vlagents_ray.protocol.messages import OPS, Limits, LocalAddress, Op, Reply, boot_id, peer_process
 from vlagents_ray.serve.access.api_keys import Caller, NoKey
 from vlagents_ray.serve.endpoints.connection import (
     BACKLOG,
@@ -96,8 +96,9 @@ class UnixServer(PolledServer["UnixConnection"]):
         self.payload, self.ops = payload, ops
 
     def _add_client(self, connection: socket.socket) -> None:
-        if peer_uid(connection) != os.getuid():
-            logger.warning("a process of another user tried to connect")
+        pid, uid = peer_process(connection)
+        if uid != os.getuid():
+            logger.warning("the process %d of user %d tried to connect, which is not this server's user", pid, uid)
             connection.close()
             return
         if len(self._clients) >= self.engine.sessions.limit:
