@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from typing import Literal
 
 import numpy as np
@@ -21,8 +22,11 @@ class Swinging(Agent):
 
     contract: Contract | None = None
 
-    def __init__(self, random: np.random.Generator, hz: float, share: float, *, delta: bool) -> None:
+    def __init__(
+        self, random: np.random.Generator, hz: float, share: float, *, delta: bool, chunk: int | None = None
+    ) -> None:
         self.contract = Contract(action=ActionSpec(dim=1, space="joint", delta=delta))
+        self._chunk = chunk or int(2 * RUN_S * hz)
         self._delta, self._hz = delta, hz
         self._turn = 2 * np.pi * random.uniform(0.05, 3.0)  # rad/s
         self._phase = random.uniform(0, 2 * np.pi)
@@ -34,7 +38,7 @@ class Swinging(Agent):
         return self._radius * np.sin(self._turn * np.asarray(row) / self._hz + self._phase)
 
     def act(self, obs: Obs) -> Act:
-        rows = int(obs.state["row"][0]) + np.arange(int(2 * RUN_S * self._hz))
+        rows = int(obs.state["row"][0]) + np.arange(self._chunk)
         actions = self.pose(rows)
         if self._delta:
             actions = actions - self.pose(rows - 1)
@@ -42,11 +46,20 @@ class Swinging(Agent):
 
 
 def executed(
-    random: np.random.Generator, mode: Literal["open_loop", "async"], share: float, soft_start_s: float, *, delta: bool
+    random: np.random.Generator,
+    mode: Literal["open_loop", "async"],
+    share: float,
+    soft_start_s: float,
+    *,
+    delta: bool,
+    chunk: int | None = None,
 ) -> tuple[float, int]:
-    """Return the share of a run's ticks that were rows of the plan, and the number of refused actions."""
+    """Return the share of a run's ticks that were rows of the plan, and the number of refused actions.
+
+    With chunks of a stated length, each answer comes within a tick.
+    """
     hz = float(random.choice([10, 30, 50, 100]))
-    policy = Swinging(random, hz, share, delta=delta)
+    policy = Swinging(random, hz, share, delta=delta, chunk=chunk)
     # Where the first row is, a row before it, between rows, and ahead of it.
     pose = np.float32(policy.pose(random.choice([0.0, -1.0, -0.5, 0.3])))
     guard = Guard(
@@ -67,6 +80,8 @@ def executed(
 
         player.reset(observed())
         for _ in range(ticks):
+            while chunk is not None and player._asker is not None and player._asker.busy:
+                time.sleep(0)
             act = player.act(observed())
             refused += act.info.get("safe_cause") in ("dynamics", "max_step", "limits")
             assert SAFE not in act.info or act.info["safe_cause"] in ("dynamics", "max_step", "waiting")
@@ -95,3 +110,25 @@ def test_answers_during_the_ease_in_do_not_keep_the_robot_from_moving(delta: boo
     for _ in range(5):
         rows, _ = executed(random, "async", 0.5, 0.0, delta=delta)
         assert rows > 0.3
+
+
+@pytest.mark.parametrize("delta", [False, True], ids=["absolute", "relative"])
+@pytest.mark.parametrize(
+    ("mode", "chunk", "at_least"),
+    [
+        # The shorter the chunks, the lower the speed at which the ramp can end exactly at each last row.
+        ("open_loop", 1, 0.15),
+        ("open_loop", 2, 0.25),
+        ("open_loop", 3, 0.3),
+        ("open_loop", 8, 0.5),
+        ("async", 3, 0.25),
+        ("async", 8, 0.5),
+    ],
+)
+def test_a_plan_of_chunks_shorter_than_the_ramp_is_executed(
+    mode: Literal["open_loop", "async"], chunk: int, at_least: float, *, delta: bool
+) -> None:
+    random = np.random.default_rng(chunk)
+    for _ in range(RUNS):
+        rows, _ = executed(random, mode, 0.5, 0.0, delta=delta, chunk=chunk)
+        assert rows > at_least

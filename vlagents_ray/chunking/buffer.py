@@ -132,6 +132,11 @@ class ChunkBuffer:
         step = self._at(self.executed + 1)
         return None if step is None else step.action
 
+    @property
+    def known(self) -> int:
+        """The number of actions from `next` to the end of the plan."""
+        return max((chunk.end for chunk in self._chunks), default=self.executed) - self.executed
+
     def advance(self) -> None:
         """Count `next`, or an action in its place, as executed."""
         self.executed += 1

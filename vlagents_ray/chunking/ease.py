@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 
 import numpy as np
+
+_ROUNDING = 1e-9
 
 
 class EaseIn:
@@ -14,6 +17,10 @@ class EaseIn:
     at rest at both ends. Then the speed along the rows rises from zero to theirs within `ramp` ticks, in which half as
     many rows are executed; so the ramp ends exactly at a row. The motion begins at rest, at the first row: if the ramp
     began before it, a robot that is already there would meet the second row at an arbitrary speed.
+
+    If fewer rows are known, such as those of a short chunk, the ramp has a section for each chunk, which ends exactly
+    at its last row. The next section begins with the speed of the last one. If the full speed is out of reach, a
+    section ends with a speed at which the next one, for as many rows, need not brake.
 
     Args:
         start: The pose at rest, (D,), in the action's units; its deltas are not used.
@@ -31,7 +38,11 @@ class EaseIn:
         self._deltas, self._at_once = list(deltas), list(at_once)
         self._is_motion = bool(self._deltas)  # a row of deltas is a motion, so that the ramp begins before it
         self._tick = -approach  # of the ramp
-        self._place = 0.0  # on the plan, in rows since the ramp's begin
+        self._speed = 0.0 if ramp else 1.0  # rows a tick
+        self._rise = 0.0  # of the speed, a tick
+        self._place = 0.0  # on the plan, in rows since the section's begin
+        self._rows = 0  # of the section
+        self._ticks = 0  # of the section that are left
 
     @property
     def arrived(self) -> bool:
@@ -41,14 +52,20 @@ class EaseIn:
     @property
     def over(self) -> bool:
         """Whether the full speed is reached."""
-        return self._tick >= self._ramp
+        return self.arrived and self._ticks == 0 and self._is_full(self._speed)
 
-    def step(self, action: np.ndarray, after: np.ndarray | None) -> tuple[np.ndarray, int]:
+    @property
+    def may_end(self) -> bool:
+        """Whether the next row may be tried at full speed: between two sections, after the time of a whole ramp."""
+        return self._ticks == 0 and self._tick >= self._ramp
+
+    def step(self, action: np.ndarray, after: np.ndarray | None, known: int) -> tuple[np.ndarray, int]:
         """Return the command of a tick, and the number of rows that it completes.
 
         Args:
             action: The next row of the plan, (D,).
             after: The row behind it, (D,); None if there is none.
+            known: The number of rows from `action` to the end of the plan.
 
         Returns:
             The command, (D,) float32, and 0 or 1.
@@ -63,7 +80,9 @@ class EaseIn:
                 return command, 0
             self._from = action
             return command, 0 if self._is_motion else 1
-        before, self._place = self._place, self._tick**2 / (2 * self._ramp)
+        if not self._ticks:
+            self._begin_section(known)
+        before, self._place = self._place, self._next_place()
         row = int(self._place)
         share = self._place - row
         if row == int(before):
@@ -72,12 +91,54 @@ class EaseIn:
             return command, 0
         self._from = action
         if after is None or share == 0.0:
+            self._ticks = self._ticks if after is not None else 0  # a shorter plan ends the section
             command = action.copy()
             command[self._deltas] = (row - before) * action[self._deltas]
             return command, 1
         command = self._between(after, share)
         command[self._deltas] = (row - before) * action[self._deltas] + share * after[self._deltas]
         return command, 1
+
+    def _begin_section(self, known: int) -> None:
+        """Begin the section of the ramp that ends at full speed, or else at the last known row."""
+        self._place = 0.0
+        first = math.ceil((1.0 - self._speed**2) * self._ramp / 2)
+        for rows in range(max(1, first), known + 1):
+            ticks = math.ceil(2 * rows / (1.0 + self._speed))
+            rise = self._rise_of(rows, ticks)
+            if 0.0 <= rise * self._ramp <= 1.0 + _ROUNDING and self._is_full(self._speed + ticks * rise):
+                self._rows, self._ticks, self._rise = rows, ticks, rise
+                return
+        self._rows, self._ticks = known, self._ticks_until_end(known)
+        self._rise = self._rise_of(self._rows, self._ticks)
+
+    def _next_place(self) -> float:
+        """Return the place after this tick, at which the speed rises evenly."""
+        self._ticks -= 1
+        place = self._place + self._speed + self._rise / 2
+        self._speed += self._rise
+        return float(self._rows) if self._ticks == 0 else place
+
+    def _ticks_until_end(self, rows: int) -> int:
+        """Return the ticks until the last known row, with the largest speed that the next section can keep."""
+        ticks = 1
+        while ticks * self._speed + ticks**2 / (2 * self._ramp) < rows - _ROUNDING:
+            ticks += 1
+        while (ticks + 1) * self._speed <= rows:
+            speed = self._speed + ticks * self._rise_of(rows, ticks)
+            again = math.floor(rows / speed)
+            if speed <= 1.0 and again and rows - again * speed <= again**2 / (2 * self._ramp):
+                break
+            ticks += 1
+        return ticks
+
+    def _rise_of(self, rows: int, ticks: int) -> float:
+        """Return the rise of the speed a tick, with which these ticks execute the rows."""
+        return 2 * (rows - ticks * self._speed) / ticks**2
+
+    def _is_full(self, speed: float) -> bool:
+        """Return whether a speed is within one rise of that of the rows."""
+        return speed * self._ramp >= self._ramp - 1 - _ROUNDING
 
     def _between(self, action: np.ndarray, share: float) -> np.ndarray:
         """Return the pose at a share of the way to an action, (D,) float32."""

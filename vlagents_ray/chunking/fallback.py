@@ -250,9 +250,14 @@ class Motion:
             ease = ease_in(start, action, plan=plan.leftover())
             if ease is not None:
                 self._ease, self._last, self._state = ease, start, "moving"
-        if self._ease is None or self._ease.over:
+        ease = self._ease
+        if ease is None or ease.over:
             return self.move(action, obs), 1
-        command, rows = self._ease.step(action, plan.after)
+        if ease.may_end:  # chunks too short for the full speed: as soon as the check accepts it
+            with contextlib.suppress(InvalidAction):
+                self._last, self._ease = self._checked(action, self._last), None
+                return self._last, 1
+        command, rows = ease.step(action, plan.after, plan.known)
         self._last = self._checked(command, self._last)
         return self._last, rows
 

@@ -258,7 +258,7 @@ class Guard:
         ease = self.ease_in(last, rest, far=True)
         yield last  # the way begins at rest
         while ease is not None and not ease.arrived:
-            command, _ = ease.step(rest, None)
+            command, _ = ease.step(rest, None, 1)
             yield command
 
     def _limits_of(self, dim: int) -> list[list[float]]:
