@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import datetime
 import inspect
 import numbers
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
@@ -14,6 +15,12 @@ from vlagents_ray.errors import ConfigError, shown
 from vlagents_ray.naming import did_you_mean
 
 _WORD_ERRORS = ("int_parsing", "float_parsing", "bool_parsing", "list_type")
+# How to write a value, by the type of error and the type of the value.
+_SPELLINGS = {
+    ("list_type", dict): "; begin each of its entries with '- '",
+    ("string_type", bool): "; put the word in quotation marks",
+    ("string_type", datetime.date): "; put it in quotation marks",
+}
 _WANT = "Input should be "  # pydantic's wording
 # Types of values that a plain type allows: also numpy's, and whole numbers for a float, since YAML reads 1 as int.
 _PLAIN: dict[type, tuple[type, ...]] = {
@@ -96,7 +103,10 @@ def _sentence(item: Mapping[str, Any], model: type | None, option: str | None) -
         got = shown(item["input"])
         message += did_you_mean(item["input"], item["ctx"]["expected"].split("'")[1::2])
     if message.startswith(_WANT):
-        message = f"got {got}, want {message.removeprefix(_WANT)}"
+        spelling = _SPELLINGS.get((item["type"], type(item["input"])), "")
+        message = f"got {got}, want {message.removeprefix(_WANT)}{spelling}"
+    if item["type"] == "path_type":
+        message = f"got {got}, want a path"
     if item["type"] in ("model_type", "model_attributes_type", "dict_type"):
         takes = sorted(_fields(model, item["loc"]))
         message = f"got {got}, want a mapping" + (f" with some of {takes}" if takes else "")
@@ -107,6 +117,8 @@ def _sentence(item: Mapping[str, Any], model: type | None, option: str | None) -
     elif item["type"] == "extra_forbidden":
         takes = sorted(beside)
         message = "there is no such setting"
+        if ":" in name:
+            message += " (write a space after the colon)"
         if takes:
             message += f"; want one of {takes}{did_you_mean(name, takes)}"
     return f"{where}: {message}" if where else message

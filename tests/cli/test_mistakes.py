@@ -137,6 +137,31 @@ COMMANDS: dict[str, tuple[list[str], list[str]]] = {
     "exponent": (["eval", run().replace("envs:", "episodes: 1e12\n  envs:")], ["1000000"]),
     "text for a list": (["eval", run(suites=[{"envs": "tabletop"}])], ["'tabletop'", "[tabletop]"]),
     "word of no list": (["eval", run(video="all_of_them")], ["all_of_them", "'failures'"]),
+    "no space after a colon": (["eval", run(policies=[{"source:scripted": None}])], ["write a space after the colon"]),
+    "entries without a dash": (["eval", run(policies=POLICY)], ["policies: got dict", "begin each of its entries"]),
+    "a word that YAML reads as a boolean": (
+        ["eval", run(policies=[{"source": False}])],
+        ["source: got False", "quotation marks"],
+    ),
+    "a date": (
+        ["eval", run().replace("source: noop", "source: 2026-01-01")],
+        ["source: got date", "quotation marks"],
+    ),
+    "a list as a path": (["eval", run(out=["a"])], ["out: got list, want a path"]),
+    "a number as a path": (["eval", run(out=5)], ["out: got 5, want a path"]),
+    "an anchor at the top": (["eval", "a: &a [tabletop]\n" + run()], ["a: there is no such setting"]),
+    "an anchor in itself": (["eval", "policies: &a [*a]\n"], ["policies.0: got list", "want a mapping"]),
+    "several documents": (["eval", run() + "---\n" + run()], ["not YAML", "document"]),
+    "a tag of Python": (["eval", "policies: !!python/object/apply:os.system [id]\n"], ["not YAML", "line 1"]),
+    "nested too deeply": (["eval", "policies: " + "[" * 3000], ["not YAML", "nested too deeply"]),
+    "no entries": (["eval", run(policies=[])], ["policies", "at least 1"]),
+    "an empty key": (["eval", run(suites=None)], ["suites: got NoneType", "list"]),
+    "a number as a key": (["eval", "1: 2\n" + run()], ["1: ", "string"]),
+    "a folder as a file": (["eval", "folder.yaml"], ["expected a file, got a folder"]),
+    "slurm: setup absent": (
+        ["slurm", "serve", "noop", "--dry-run", "--setup", "no.sh"],
+        ["--setup: expected a file of shell lines", "no.sh"],
+    ),
     "no source": (["eval", run(policies=[{"name": "x"}])], ["source", "url"]),
     "source and url": (["eval", run(policies=[POLICY | {"url": "http://x:1"}])], ["source", "url", "both"]),
     "one name twice": (["eval", run(policies=[POLICY, POLICY])], ["name"]),
@@ -206,6 +231,7 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     monkeypatch.delitem(sys.modules, "own", raising=False)
     monkeypatch.setattr(sys, "dont_write_bytecode", True)  # Python writes it beside own.py, which is no result
     (tmp_path / "own.py").write_text(POLICIES)
+    (tmp_path / "folder.yaml").mkdir()
     for name, text in (("emptied", ""), ("texted", "no database")):
         (tmp_path / name).mkdir()
         (tmp_path / name / "results.db").write_text(text)

@@ -129,6 +129,8 @@ def parse_time(text: str, option: str) -> float:
 
 def read_run_file(file: Path, kind: str, keys: str) -> dict[str, Any]:
     """Read a YAML file of the settings of a run; results go to runs/NAME unless it names a folder."""
+    if file.is_dir():
+        raise ConfigError(f"{kind} {str(file)!r}: expected a file, got a folder; name a .yaml file in it")
     if not file.is_file():
         raise ConfigError(f"{kind} {str(file)!r} does not exist")
     document = read_yaml(file)
