@@ -1,6 +1,6 @@
 """A keyed replica in a process of its own, and one that floods it.
 
-`flood.py serve`, and `flood.py attack WAY PART WHERE CONNECTIONS S`.
+`flood.py serve`, `flood.py gateways`, and `flood.py attack WAY PART WHERE CONNECTIONS S`.
 """
 
 from __future__ import annotations
@@ -18,13 +18,14 @@ import threading
 import time
 import zlib
 from collections.abc import Callable, Iterator
-from dataclasses import asdict
+from dataclasses import asdict, dataclass
 from functools import cache, partial
 from pathlib import Path
 from typing import Any
 
 import hostile_images
 import numpy as np
+import rpyc_client
 from asgi_server import served
 from dialect_server import ALL, METADATA
 from websockets.client import ClientProtocol
@@ -32,28 +33,36 @@ from websockets.extensions.permessage_deflate import ClientPerMessageDeflateFact
 from websockets.protocol import State
 from websockets.uri import parse_uri
 
+from vlagents_ray.client.agent import RemoteAgent
 from vlagents_ray.client.credentials import Credentials
 from vlagents_ray.client.transports.shm import ShmTransport
+from vlagents_ray.errors import PolicyUnavailable
 from vlagents_ray.images import jpeg_png
 from vlagents_ray.interface import Act, Agent, Obs
 from vlagents_ray.protocol import frame_layout
 from vlagents_ray.protocol.frames import CONTENT_TYPE
 from vlagents_ray.protocol.messages import Limits, LocalAddress, Request
 from vlagents_ray.protocol.websocket_frames import frame_head
-from vlagents_ray.serve.access.api_keys import Keys
+from vlagents_ray.registry import dialect_class
+from vlagents_ray.serve.access.api_keys import Keys, NoKey
 from vlagents_ray.serve.config.dialects import DialectArgs
-from vlagents_ray.serve.dialects.base import ReplicaContext, dialect_routes
+from vlagents_ray.serve.dialects import gr00t, vlagents
+from vlagents_ray.serve.dialects.base import GatewayContext, ReplicaContext, dialect_routes
 from vlagents_ray.serve.endpoints.access_middleware import AccessMiddleware
 from vlagents_ray.serve.endpoints.front import FrontMiddleware
 from vlagents_ray.serve.endpoints.http import build_http_app
 from vlagents_ray.serve.endpoints.shm import ShmServer
 from vlagents_ray.serve.endpoints.websocket import WebSocketServer
+from vlagents_ray.serve.engine.admission import Admission
 from vlagents_ray.serve.engine.engine import Engine
-from vlagents_ray.wire import json_numpy
+from vlagents_ray.serve.ports import reserve
+from vlagents_ray.wire import gr00t as gr00t_wire
+from vlagents_ray.wire import json_numpy, rpyc, zmtp
 from vlagents_ray.wire import openpi as openpi_codec
 from vlagents_ray.wire import vla_eval as vla_eval_codec
 
 HEIGHT, WIDTH = 2304, 4096  # of the largest image
+GATEWAYS_IN_FLIGHT = 256 * 2**20  # bytes; a key or an address may take half of it
 IMAGES = 4  # of these in the largest request
 SLOW_S = 6.0  # time in which a message must arrive
 UNIX = socket.AF_UNIX, socket.SOCK_SEQPACKET
@@ -70,7 +79,7 @@ def _key(name: str, **limits: Any) -> dict[str, Any]:
 
 def key_of(way: str) -> str:
     """The key of whoever floods that way, which is its name, too."""
-    return f"way-{list(WAYS).index(way)}"
+    return f"way-{[*WAYS, *GATEWAYS].index(way)}"
 
 
 def serve() -> None:
@@ -93,6 +102,32 @@ def serve() -> None:
         sys.stdin.read()
     engine.close()
     own.close(), near.close()
+
+
+def _no_replica(*_: object) -> RemoteAgent:
+    raise PolicyUnavailable("there is no replica")
+
+
+def serve_gateways() -> None:
+    """Serve the dialects with their own port, without a replica; print their ports as JSON."""
+    rated = [_key(key_of(way), rate=1, rank="simulation") for way in GATEWAYS]
+    keys = Keys.from_text(json.dumps({"keys": [_key("robot"), *rated]}))
+    limits = Limits()
+    gr00t._MESSAGE_S = vlagents._FRAME_S = SLOW_S
+    dialects, ports = [], {}
+    for name, check in (("gr00t", partial(keys.check, app="app")), ("vlagents", NoKey.OPEN), ("lerobot", NoKey.OPEN)):
+        admission = Admission(GATEWAYS_IN_FLIGHT)
+        context = GatewayContext("app", _no_replica, limits, 100, 600.0, None, check, admission)
+        cls = dialect_class(name)
+        listener = reserve(name, "127.0.0.1", 0)
+        ports[name] = listener.getsockname()[1]
+        dialect = cls(name, cls.Config(), context)
+        dialect.serve(listener)
+        dialects.append(dialect)
+    print(json.dumps({"gateways": ports}), flush=True)
+    sys.stdin.read()
+    for dialect in dialects:
+        dialect.close()
 
 
 def _jpeg() -> bytes:
@@ -375,18 +410,103 @@ def misbehave(path: str, behaviour: str, where: Where, key: str, end: float) -> 
                 connection.sendall(payload)
 
 
+@dataclass(frozen=True)
+class Behaviour:
+    """What a client of a gateway sends over a connection: once, then a part again and again, or byte by byte."""
+
+    once: Callable[[str], bytes]  # the first bytes, with a key
+    repeated: bytes = b""
+    period_s: float = 0.0  # between two of the repeated parts
+    waits: bool = True  # whether the client then waits for the end of the connection
+
+
+def _zmtp(content: bytes = b"") -> bytes:
+    """A DEALER's greeting and READY, and what follows them."""
+    ready = b"\x05READY\x0bSocket-Type\x00\x00\x00\x06DEALER"
+    return zmtp.GREETING + b"\x04" + bytes([len(ready)]) + ready + content
+
+
+def _gr00t(key: str, **more: Any) -> bytes:
+    return zmtp.write_message([b"", gr00t_wire.pack({"endpoint": "ping", "api_token": key, **more})])
+
+
+_HALF = b"\x02" + struct.pack(">Q", 60 * 2**20) + bytes(50 * 2**20)
+_EMPTY_PARTS = b"\x01\x00" * 2**17
+_ZMQ_PING = b"\x04\x07\x04PING\x00\x00"
+_HTTP2 = b"PRI * HTTP/2.0\r\n\r\nSM\r\n\r\n" + bytes(3) + b"\x04" + bytes(5)  # and empty settings
+_HTTP2_PING = b"\x00\x00\x08\x06" + bytes(13)
+_HTTP2_SETTINGS = b"\x00\x00\x00\x04" + bytes(5)
+_RPYC_HALF = rpyc.HEADER.pack(60 * 2**20, 0) + bytes(50 * 2**20)
+_RPYC_PING = rpyc_client.request(1, rpyc.Handler.PING, (2, ()))
+_OF_ANY = {
+    "nothing": Behaviour(lambda _: b""),
+    "closed at once": Behaviour(lambda _: b"", waits=False),
+}
+GATEWAYS: dict[str, dict[str, Behaviour]] = {
+    "gr00t": {
+        **_OF_ANY,
+        "half a handshake": Behaviour(lambda _: zmtp.GREETING[:40]),
+        "a refused handshake": Behaviour(lambda _: b"\xff" + bytes(8) + b"\x7f\x01\x05\x00\x00", waits=False),
+        "half a message": Behaviour(lambda _: _zmtp(_HALF)),
+        "one part of many": Behaviour(lambda _: _zmtp(), _EMPTY_PARTS),
+        "parts of a message": Behaviour(lambda _: _zmtp(), b"\x03" + struct.pack(">Q", 2**20) + bytes(2**20)),
+        "pings": Behaviour(lambda _: _zmtp(), _ZMQ_PING * 1000),
+        "messages with a wrong key": Behaviour(lambda _: _zmtp(), _gr00t("wrong") * 10),
+        "empty messages": Behaviour(lambda _: _zmtp(), bytes(2) * 1000),
+        "half a message, with a key": Behaviour(lambda key: _zmtp(_gr00t(key) + _HALF)),
+        "a message byte by byte, with a key": Behaviour(lambda key: _zmtp(_gr00t(key) + _HALF[:9]), b"x", 0.05),
+        "one part of many, with a key": Behaviour(lambda key: _zmtp(_gr00t(key)), _EMPTY_PARTS),
+        "a key over its rate": Behaviour(lambda key: _zmtp(_gr00t(key)), b"key"),
+    },
+    "vlagents": {
+        **_OF_ANY,
+        "half a head": Behaviour(lambda _: b"\x00"),
+        "half a message": Behaviour(lambda _: _RPYC_HALF),
+        "a message byte by byte": Behaviour(lambda _: _RPYC_HALF[: rpyc.HEADER.size], b"x", 0.05),
+    },
+    "lerobot": {
+        **_OF_ANY,
+        "half a handshake": Behaviour(lambda _: _HTTP2[:10]),
+        "a refused handshake": Behaviour(lambda _: b"GET / HTTP/1.1\r\n\r\n"),
+        "pings": Behaviour(lambda _: _HTTP2, _HTTP2_PING * 1000),
+        "settings": Behaviour(lambda _: _HTTP2, _HTTP2_SETTINGS * 1000),
+    },
+}
+
+
+OF_GRPC = [("lerobot", "pings"), ("lerobot", "settings")]  # what gRPC's own library reads and answers
+
+
+def misbehave_at_gateway(way: str, name: str, where: Where, end: float) -> None:
+    """Behave in that way over one connection, until the gateway ends it, or until the `end`."""
+    behaviour, key = GATEWAYS[way][name], key_of(way)
+    repeated = _gr00t(key, data=bytes(4 * 2**20)) if behaviour.repeated == b"key" else behaviour.repeated
+    with socket.create_connection(("127.0.0.1", where["gateways"][way]), timeout=5) as connection:
+        connection.settimeout(max(0.01, end - time.monotonic()))
+        connection.sendall(behaviour.once(key))
+        if repeated:
+            threading.Thread(target=_drain, args=(connection,), daemon=True).start()
+            while time.monotonic() < end:
+                connection.sendall(repeated)
+                time.sleep(behaviour.period_s)
+        elif behaviour.waits:
+            _drain(connection)
+
+
 def attack(way: str, part: str, where: Where, connections: int, seconds: float) -> None:
     """Send the largest messages, or misbehave, for so long, as fast as bytes are taken, whatever is answered."""
-    make, send = WAYS[way]
+    make, send = WAYS.get(way, (bytes, _shared_memory))
     end = time.monotonic() + seconds
-    message = b"" if part in BEHAVIOURS else PARTS.get(part, make)()
+    message = b"" if part in BEHAVIOURS or way in GATEWAYS else PARTS.get(part, make)()
     if part in REPEATED:
         REPEATED[part]()  # before it is measured, since the bomb takes time to make
 
     def flood() -> None:
         while time.monotonic() < end:
             with contextlib.suppress(OSError):  # cut off: once more
-                if part in BEHAVIOURS:
+                if way in GATEWAYS:
+                    misbehave_at_gateway(way, part, where, end)
+                elif part in BEHAVIOURS:
                     misbehave(WEBSOCKETS[way], part, where, key_of(way), end)
                 else:
                     send(message, where, key_of(way), end)
@@ -441,12 +561,21 @@ def robot(where: Where) -> Iterator[ShmTransport]:
 
 def acts_ms(robot: ShmTransport, seconds: float) -> list[float]:
     """Return how long a robot's acts took, sorted, one each 10 ms."""
+
+    def act() -> None:
+        [reply] = robot.call([Request("act", OBS)], 60)
+        assert reply.error is None
+
+    return times_ms(act, seconds)
+
+
+def times_ms(call: Callable[[], object], seconds: float) -> list[float]:
+    """Return how long a robot's calls took, sorted, one each 10 ms."""
     taken, end = [], time.monotonic() + seconds
     while time.monotonic() < end:
         begun = time.perf_counter()
-        [reply] = robot.call([Request("act", OBS)], 60)
+        call()
         taken.append((time.perf_counter() - begun) * 1e3)
-        assert reply.error is None
         time.sleep(0.01)
     return sorted(taken)
 
@@ -459,5 +588,7 @@ def percentile(taken: list[float], percent: float) -> float:
 if __name__ == "__main__":
     if sys.argv[1] == "serve":
         serve()
+    elif sys.argv[1] == "gateways":
+        serve_gateways()
     else:
         attack(sys.argv[2], sys.argv[3], json.loads(sys.argv[4]), int(sys.argv[5]), float(sys.argv[6]))
