@@ -249,3 +249,69 @@ def test_the_requests_of_a_message_are_seen_around_its_answer_without_those_that
         "answer 1 to a",
         "answer 2 to b",
     ]
+
+
+class Listed(Agent):
+    """Notes the operations that it has executed."""
+
+    def __init__(self) -> None:
+        self.executed = Executed()
+
+    def shared_objects(self) -> list[object]:
+        return [self.executed]
+
+    def reset(self, obs: Obs, instruction: str | None, **kwargs: object) -> dict[str, object]:
+        self.executed.append("reset")
+        return {}
+
+    def act(self, obs: Obs) -> Act:
+        self.executed.append("act")
+        return Act(np.zeros(1))
+
+
+class Executed(list[str]):
+    """Operations, of all sessions."""
+
+
+STEPS = {"reset": ("take", "run", "hold", "begin_episode"), "act": ("take", "run", "ready", "act")}
+
+
+@pytest.mark.parametrize(("op", "step"), [(op, step) for op, steps in STEPS.items() for step in steps])
+def test_no_request_is_executed_of_which_a_deadline_said_that_it_never_will_be(
+    op: str, step: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The deadline passes at each step on the way from the queue to the policy."""
+    policy = Listed()
+    engine = Engine(policy)
+    engine.start()
+    sender = Sender(engine, "test", "robot-1", caller=NoKey.OPEN, connected=False)
+    replies: queue.SimpleQueue[list[Reply]] = queue.SimpleQueue()
+    send(sender, [Request("reset", Obs())], replies.put)
+    assert replies.get(timeout=10)[0].error is None
+    policy.executed.clear()
+    owner, method = {
+        "take": (engine.queue, "take"),
+        "run": (engine, "_run"),
+        "hold": (engine.models, "hold"),
+        "begin_episode": (engine, "_begin_episode"),
+        "ready": (engine, "_ready"),
+        "act": (engine, "_act"),
+    }[step]
+    original = getattr(owner, method)
+    sent: list[PendingRequest] = []
+    queued = threading.Event()
+    said_never: list[bool] = []
+
+    def late(*arguments: object) -> object:
+        if queued.wait(10) and not said_never:  # as `Sender._expire` does, on another thread
+            engine.withdraw(*sent)
+            said_never.append(not sent[0].begun)
+        return original(*arguments)
+
+    monkeypatch.setattr(owner, method, late)
+    sent += send(sender, [Request(op, Obs())], replies.put)  # type: ignore[arg-type]
+    queued.set()
+    wait_for(lambda: said_never)
+    engine.close()
+    assert said_never == [step == "take"]
+    assert policy.executed == ([] if step == "take" else [op])

@@ -5,15 +5,19 @@ from __future__ import annotations
 import random
 import time
 from collections import Counter, defaultdict
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 
 import pytest
+from gain_policies import Gain
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from in_flight import pending
+from in_flight import pending, send
+from in_memory_keys import ChangingKeys
 
 from vlagents_ray.errors import PolicyUnavailable
 from vlagents_ray.protocol.messages import Request
+from vlagents_ray.serve.engine.engine import Engine
+from vlagents_ray.serve.engine.sender import Sender
 from vlagents_ray.serve.queue.batch_queue import BatchQueue
 from vlagents_ray.serve.queue.fair_queue import PATIENCE_S, FairQueue
 from vlagents_ray.serve.requests import Origin, PendingRequest, Rank
@@ -53,6 +57,31 @@ def test_a_large_bundle_delays_others_by_no_more_than_a_batch() -> None:
     first = taken(waiting)
     assert {f"env{i}" for i in range(10)} <= set(first)
     assert len(first) == 16
+
+
+@pytest.mark.parametrize("connected", [False, True])
+@pytest.mark.parametrize("named", [False, True])
+def test_keys_with_equal_names_of_sessions_have_turns_of_their_own(connected: bool, named: bool) -> None:
+    """Many sessions of another key, whose sender has the robot's name, delay the robot by no more than a batch."""
+    keys, engine = ChangingKeys(), Engine(Gain())
+    waiting = FairQueue()
+
+    def submit(requests: Sequence[PendingRequest]) -> None:
+        for request in requests:
+            waiting.add(request)
+
+    engine.submit = submit  # type: ignore[method-assign]
+    tokens = {key: keys.add(key) for key in ("other", "own")}
+
+    def act(key: str, session: str) -> None:
+        caller = keys.keys.check(tokens[key], "app")
+        sender = Sender(engine, "http", "robot-1", caller=caller, connected=connected)
+        send(sender, [Request("act", session=session)], lambda _: None)
+
+    for number in range(64):
+        act("other", f"env-{number}")
+    act("own", "robot-1" if named else "")
+    assert "own/robot-1" in taken(waiting, 2)
 
 
 def test_alone_a_bundle_fills_the_batch_in_its_order() -> None:
