@@ -1,9 +1,9 @@
 """Names of policies, wrappers, environments, dialects and commands, the location of their code, and their requirements.
 
 A name leads to a `RegistryEntry`, whose class is imported only when it is used. Plug-ins add entries through the
-entry-point groups `vlagents_ray.policies`, `.wrappers`, `.envs`, `.dialects` and `.commands`: an entry point names a
-`RegistryEntry` in a module that imports nothing large. A `"module:Class"` in a deployment file works without
-registration. Wrappers change the observations of any policy, or its actions.
+entry-point groups `vlagents_ray.policies`, `.wrappers`, `.envs`, `.dialects`, `.commands` and `.replica`: an entry
+point names a `RegistryEntry` in a module that imports nothing large. A `"module:Class"` in a deployment file works
+without registration. Wrappers change the observations of any policy, or its actions.
 
 The tables of README and docs/ are made from these entries: `python tests/support/tables.py`.
 """
@@ -195,6 +195,7 @@ _BUILT_IN: dict[str, dict[str, RegistryEntry]] = {
     "envs": ENVS,
     "dialects": DIALECTS,
     "commands": {},  # those of this package are in `cli.main`
+    "replica": {},  # parts of a replica
 }
 _SINGULAR = {
     "policies": "policy",
@@ -202,6 +203,7 @@ _SINGULAR = {
     "envs": "environment",
     "dialects": "dialect",
     "commands": "command",
+    "replica": "part of a replica",
 }
 
 # extra of this package -> import names of what it installs, beside those of the adapters
@@ -396,22 +398,22 @@ def not_installed(kind: str) -> dict[str, str]:
 
 def policy_class(name: str) -> type[Any]:
     """Return the Agent class registered as `name`, or given as "module:Class"."""
-    return _registered_class("policies", name, UnknownPolicy)
+    return registered_class("policies", name, UnknownPolicy)
 
 
 def wrapper_class(name: str) -> type[Any]:
     """Return the wrapper class registered as `name`, or given as "module:Class"."""
-    return _registered_class("wrappers", name, UnknownWrapper)
+    return registered_class("wrappers", name, UnknownWrapper)
 
 
 def dialect_class(name: str) -> type[Any]:
     """Return the dialect class registered as `name`, or given as "module:Class"."""
-    return _registered_class("dialects", name, ConfigError)
+    return registered_class("dialects", name)
 
 
 def env_class(name: str) -> type[Any]:
     """Return the EvalEnv class for `name`, e.g. "tabletop" or "maniskill/PushCube-v1"."""
-    return _registered_class("envs", env_suite(name), UnknownEnv)
+    return registered_class("envs", env_suite(name), UnknownEnv)
 
 
 def env_suite(name: str) -> str:
@@ -429,7 +431,7 @@ def _is_class(name: str) -> bool:
     return ":" in name and name.partition("/")[0] not in names("envs")
 
 
-def _registered_class(kind: str, name: str, unknown: type[ConfigError]) -> type[Any]:
+def registered_class(kind: str, name: str, unknown: type[ConfigError] = ConfigError) -> type[Any]:
     """Return the class registered as `name`, or given as "module:Class"; raises `unknown` if there is none."""
     target = target_of(kind, name)
     if ":" not in target:

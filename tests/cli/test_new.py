@@ -64,6 +64,29 @@ def test_the_next_steps_run_as_they_are_printed_and_without_pytest(kind: str, fo
     assert (folder / "runs").exists() == (kind != "dialect")
 
 
+@pytest.mark.server
+@pytest.mark.slow
+def test_a_skeleton_of_a_plugin_passes_its_own_test_once_it_is_installed(folder: Path) -> None:
+    status, printed = new("plugin", "my_plugin")
+    assert (status, "pip install --editable ." in printed) == (0, True)
+    plugin = folder / "my_plugin"
+    environment = ENV | {"PYTHONPATH": f"{plugin}:{ENV.get('PYTHONPATH', '')}"}
+    # What an editable install registers, without an index.
+    metadata = [sys.executable, "-c", "import setuptools; setuptools.setup()", "--quiet", "egg_info"]
+    subprocess.run(metadata, check=True, cwd=plugin, capture_output=True, timeout=60)
+    command = [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", "test_my_plugin.py"]
+    done = subprocess.run(
+        command, check=False, cwd=plugin, env=environment, capture_output=True, text=True, timeout=300
+    )
+    assert done.returncode == 0, done.stdout + done.stderr
+    listed = subprocess.run(
+        ["sh", "-c", "vlagents-ray policies my_plugin && vlagents-ray my_plugin --help"],
+        check=True, cwd=plugin, env=environment, capture_output=True, text=True, timeout=60,
+    )  # fmt: skip
+    assert "my_plugin: The policy MyPlugin: moves each joint towards zero.\n  ready" in listed.stdout
+    assert "Print how many calls a server's policy has answered" in listed.stdout
+
+
 @pytest.mark.parametrize(("on_path", "typed"), [(True, "python"), (False, "venv/bin/python")])
 def test_a_program_is_named_as_the_shell_finds_it(
     on_path: bool, typed: str, folder: Path, monkeypatch: pytest.MonkeyPatch

@@ -1,4 +1,4 @@
-"""Skeletons of a policy, an environment and a dialect, which work at once and pass their own tests.
+"""Skeletons of a policy, an environment, a dialect and a plug-in, which work at once and pass their own tests.
 
 `skeletons/KIND/` has their templates, in which `$name` is the module's name and `$title` that of its class.
 """
@@ -22,6 +22,24 @@ from vlagents_ray.cli.console import errors, out
 from vlagents_ray.errors import ConfigError
 
 new = typer.Typer(no_args_is_help=True, help="Write a working skeleton, with its test, into the current folder.")
+# Of each kind, the files that are written, with $name for the name, and their templates in skeletons/KIND.
+_MODULE = {"$name.py": "module.py", "test_$name.py": "test.py", "$name.yaml": "run.yaml"}
+_FILES = {
+    "policy": _MODULE,
+    "env": _MODULE,
+    "dialect": _MODULE,
+    "plugin": {
+        "$name/pyproject.toml": "pyproject.toml",
+        "$name/README.md": "readme",
+        "$name/$name.yaml": "run.yaml",
+        "$name/test_$name.py": "test",
+        "$name/$name/__init__.py": "init",
+        "$name/$name/registry.py": "registry",
+        "$name/$name/policy.py": "policy",
+        "$name/$name/latency.py": "latency",
+        "$name/$name/command.py": "command",
+    },
+}
 Name = Annotated[str, typer.Argument(metavar="NAME", help="Name of the module: lower case, such as my_policy.")]
 
 
@@ -59,26 +77,41 @@ def dialect(name: Name) -> None:
         )
 
 
-def _write(name: str, kind: Literal["policy", "env", "dialect"]) -> None:
+@new.command()
+def plugin(name: Name) -> None:
+    """Write the folder NAME: a package with a policy, a part of the server and a command, and their test."""
+    with errors():
+        _write(name, "plugin")
+        command, python = as_typed("vlagents-ray"), as_typed("python")
+        _print_steps(
+            (f"cd {name}", "its folder"),
+            (f"{python} -m pip install --editable .", "registers it in this environment"),
+            (f"{python} test_{name}.py", "checks it; so does pytest"),
+            (f"{command} serve {name}.yaml", "serves it"),
+        )
+
+
+def _write(name: str, kind: Literal["policy", "env", "dialect", "plugin"]) -> None:
     """Write the files into the current folder, or none of them. Raises `ConfigError` for an invalid name."""
     if not re.fullmatch(r"[a-z][a-z0-9_]*", name) or keyword.iskeyword(name):
         raise ConfigError(f"NAME: got {name!r}, want the name of a Python module in lower case, such as my_policy")
     names = {"name": name, "title": "".join(word.title() for word in name.split("_"))}
     templates = files(__package__ or "") / "skeletons" / kind
-    sources = {f"{name}.py": "module.py", f"test_{name}.py": "test.py", f"{name}.yaml": "run.yaml"}
-    texts = {
-        Path(path): Template((templates / f"{source}.template").read_text("utf-8")).substitute(names)
-        for path, source in sources.items()
-    }
+    texts = {}
+    for path, source in _FILES[kind].items():
+        template = (templates / f"{source}.template").read_text("utf-8")
+        texts[Path(Template(path).substitute(names))] = Template(template).substitute(names)
     if there := [str(path) for path in texts if path.exists()]:
         raise ConfigError(f"{', '.join(there)}: there already, and nothing was written; choose another NAME")
     if importlib.util.find_spec(name) is not None:
         raise ConfigError(f"NAME: {name!r} is a module that is installed, and yours would hide it; choose another one")
     for path, text in texts.items():
+        path.parent.mkdir(parents=True, exist_ok=True)
         with path.open("x") as file:
             file.write(text)
     out.print(f"wrote {', '.join(map(str, texts))}. Next, in this folder:")
-    _print_steps((f"{as_typed('python')} test_{name}.py", "checks it; so does pytest"))
+    if kind != "plugin":
+        _print_steps((f"{as_typed('python')} test_{name}.py", "checks it; so does pytest"))
 
 
 def as_typed(program: str) -> str:

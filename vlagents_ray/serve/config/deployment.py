@@ -19,6 +19,7 @@ from vlagents_ray.ray_tools.runtime_env import require_no_secrets
 from vlagents_ray.registry import target_of
 from vlagents_ray.serve.access.api_keys import Keys, load_keys
 from vlagents_ray.serve.config.dialects import DialectArgs
+from vlagents_ray.serve.config.parts import PartArgs
 from vlagents_ray.serve.models.checkpoints import Checkpoints
 from vlagents_ray.serve.queue.call_limits import CallLimits
 
@@ -367,6 +368,7 @@ class ServerArgs(_DeploymentModel):
     record: RecordArgs | None = Field(default=None, description="keeps requests and answers; unset: nothing is kept")
     environment: EnvironmentArgs = Field(default=EnvironmentArgs(), description="the Python that the policy runs in")
     dialects: DialectArgs = Field(default=DialectArgs(), description="other systems' clients that may connect")
+    parts: PartArgs = Field(default=PartArgs(), description="parts of the replica that plug-ins add")
 
     @property
     def initial_replicas(self) -> int:

@@ -9,15 +9,15 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Iterator, Mapping
 from functools import cache
-from typing import Any
+from typing import Any, ClassVar
 
-from pydantic import BaseModel, Field, create_model, field_validator, model_validator
-from pydantic.fields import FieldInfo
+from pydantic import BaseModel, Field, field_validator, model_validator
 
 from vlagents_ray.contract import Contract
 from vlagents_ray.errors import ConfigError
 from vlagents_ray.protocol.messages import RankName
 from vlagents_ray.registry import dialect_class, names, require
+from vlagents_ray.serve.config.registered import RegisteredArgs
 from vlagents_ray.wire import presets as wire_presets
 from vlagents_ray.wire.mapping import KeyMapping
 
@@ -65,21 +65,12 @@ class KeylessPortConfig(PortConfig):
     )
 
 
-class DialectArgs(BaseModel, extra="allow"):
+class DialectArgs(RegisteredArgs):
     """The settings of all dialects that are on, by name."""
 
-    @model_validator(mode="before")
-    @classmethod
-    def _by_their_own_models(cls, data: Any) -> Any:
-        """Check the settings of each dialect by its `Config`; raise the errors of all of them together."""
-        if not isinstance(data, Mapping):
-            return data
-        fields: dict[str, Any] = {str(name): (_config_of(str(name)) | None, None) for name in data}
-        read = create_model("_Dialects", **fields).model_validate(data)
-        found = {name: getattr(read, name) for name in fields}
-        return {
-            name: found[name] for name in dict.fromkeys((*names("dialects"), *found)) if found.get(name) is not None
-        }
+    kind: ClassVar[str] = "dialects"
+    base: ClassVar[str] = "vlagents_ray.serve.dialects.base.Dialect"
+    config_base: ClassVar[type[BaseModel]] = DialectConfig
 
     @model_validator(mode="after")
     def _ports_of_their_own(self) -> DialectArgs:
@@ -134,22 +125,6 @@ class DialectArgs(BaseModel, extra="allow"):
         for name in self.on():
             for module in dialect_class(name).requires:
                 require(module)
-
-    @classmethod
-    def registered_fields(cls) -> dict[str, FieldInfo]:
-        """Return the known settings, for messages about unknown ones."""
-        return {name: FieldInfo(annotation=_config_of(name)) for name in names("dialects")}
-
-
-def _config_of(name: str) -> type[DialectConfig]:
-    cls = dialect_class(name)
-    config = getattr(cls, "Config", None)
-    if not (isinstance(config, type) and issubclass(config, DialectConfig)):
-        raise ConfigError(
-            f"{name}: {cls.__module__}.{cls.__qualname__} has no Config; want a subclass of "
-            "vlagents_ray.serve.dialects.base.Dialect, whose Config is a DialectConfig"
-        )
-    return config
 
 
 def read_mapping(value: str | Mapping[str, Any]) -> KeyMapping:

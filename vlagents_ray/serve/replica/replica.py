@@ -43,6 +43,7 @@ from vlagents_ray.serve.observers.opening import open_observers
 from vlagents_ray.serve.ports import EVERYWHERE, HOST, LOOPBACK
 from vlagents_ray.serve.queue.batch_queue import LoadMeter
 from vlagents_ray.serve.replica.metrics import Exporter, tags_of
+from vlagents_ray.serve.replica.part import PartContext, open_parts
 from vlagents_ray.serve.scaling.autoscaling import SESSIONS, UTILISATION, WAITING
 from vlagents_ray.serve.scaling.rebalancer import ClientLocation, Rebalancer, ReplicaLoad
 from vlagents_ray.serve.scaling.session_migration import HeldSessions, SessionMigrator
@@ -106,6 +107,7 @@ class PolicyReplica(ClientApi, SiblingApi):
         # The observers.
         node = ray.get_runtime_context().get_node_id()[:8]
         self._observers = open_observers(self._engine, settings, self._peers.own_name, node, self.metadata)
+        self._parts = open_parts(settings.parts, PartContext(self._engine, self._peers.own_name, node, self.metadata))
         self._fleet = Fleet(self._observers.view, self._peers)
         self._meter = LoadMeter(self._engine.queue)
         self._metrics = Exporter(self._engine, tags_of(settings.policy), self._keys, self._observers.recorder)
@@ -169,7 +171,7 @@ class PolicyReplica(ClientApi, SiblingApi):
         for endpoint in (self._local, self._plasma, self._stream):
             if endpoint is not None:
                 endpoint.close()
-        for part in (self._observers, self._metrics):
+        for part in (self._parts, self._observers, self._metrics):
             await asyncio.to_thread(part.close)
 
     async def __del__(self) -> None:
@@ -204,6 +206,7 @@ class PolicyReplica(ClientApi, SiblingApi):
             *dialect_routes(self._args.dialects, ReplicaContext(self._engine, self.metadata, self._limits)),
             *weights_routes(self, slow_s, open_to_network=insecure),
             *live_routes(self._fleet, open_to_network=insecure),
+            *self._parts.routes(),
         ]
         inside = build_http_app(self._engine, self.metadata, self._limits, self._metadata_for_machine, more)
         return AccessMiddleware(
@@ -222,6 +225,7 @@ class PolicyReplica(ClientApi, SiblingApi):
         return policy_metadata(self._args, self._engine, self._code, self._program) | {
             "protocol": PROTOCOL_VERSION,
             "dialects": self._args.dialects.describe() | self._gateways,
+            "parts": self._parts.describe(),
             "local": None if self._local is None else asdict(self._local.address),
             "stream": None if self._stream is None else asdict(self._stream.address),
         }

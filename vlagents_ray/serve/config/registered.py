@@ -1,0 +1,49 @@
+"""Settings of registered classes by name, each checked by the `Config` of its class."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any, ClassVar
+
+from pydantic import BaseModel, create_model, model_validator
+from pydantic.fields import FieldInfo
+
+from vlagents_ray.errors import ConfigError
+from vlagents_ray.registry import names, registered_class
+
+
+class RegisteredArgs(BaseModel, extra="allow"):
+    """A section of a deployment file with a key for each class that is on: a registered name, or "module:Class"."""
+
+    kind: ClassVar[str]  # of names, as in `registry.names`
+    base: ClassVar[str]  # "module.Class" that the classes derive from, for messages
+    config_base: ClassVar[type[BaseModel]]  # that each `Config` derives from
+
+    @model_validator(mode="before")
+    @classmethod
+    def _by_their_own_models(cls, data: Any) -> Any:
+        """Check each class's settings by its `Config`; raise the errors of all of them together."""
+        if not isinstance(data, Mapping):
+            return data
+        fields: dict[str, Any] = {str(name): (cls.config_of(str(name)) | None, None) for name in data}
+        read = create_model("_Registered", **fields).model_validate(data)
+        settings = {name: getattr(read, name) for name in fields}
+        in_order = dict.fromkeys((*names(cls.kind), *settings))
+        return {name: settings[name] for name in in_order if settings.get(name) is not None}
+
+    @classmethod
+    def config_of(cls, name: str) -> type[BaseModel]:
+        """Return the model of the settings of one class; raises `ConfigError` if it has none."""
+        named = registered_class(cls.kind, name)
+        config = getattr(named, "Config", None)
+        if not (isinstance(config, type) and issubclass(config, cls.config_base)):
+            raise ConfigError(
+                f"{name}: {named.__module__}.{named.__qualname__} has no Config; want a subclass of {cls.base}, whose "
+                f"Config is a {cls.config_base.__name__}"
+            )
+        return config
+
+    @classmethod
+    def registered_fields(cls) -> dict[str, FieldInfo]:
+        """Return the known settings, for messages about unknown ones."""
+        return {name: FieldInfo(annotation=cls.config_of(name)) for name in names(cls.kind)}
