@@ -115,6 +115,16 @@ def test_an_action_over_http_is_lists_or_named_columns_where_clients_read_those(
         assert np.array(answer.json())[..., :5].tolist() == want
 
 
+@pytest.mark.parametrize("settings", [{}, {"chunk": True}, {"plain": True}])
+def test_a_request_of_openvla_without_an_instruction_is_refused(settings: Any) -> None:
+    request = body(3)
+    del request["instruction"]
+    with serving(Mirror(chunk=2), {"openvla": settings}) as (client, _):
+        answer = client.post("/act", json=request)
+    assert answer.status_code == 422
+    assert "instruction: got none" in answer.text
+
+
 def test_a_dialect_that_is_off_is_not_there() -> None:
     with serving(Mirror(), {"openvla": {}}) as (client, _):
         for path in ("/", "/openpi", "/vla-eval"):

@@ -13,6 +13,8 @@ from pydantic import Field
 from starlette.requests import Request as HttpRequest
 from starlette.responses import Response
 
+from vlagents_ray.errors import InvalidObservation
+from vlagents_ray.interface import Obs
 from vlagents_ray.protocol.messages import Budget
 from vlagents_ray.serve.config.dialects import DialectConfig, MappingSetting
 from vlagents_ray.serve.dialects.base import HttpDialect
@@ -37,6 +39,13 @@ class OpenVLADialect(HttpDialect):
     paths: ClassVar[Mapping[str, str]] = {"POST /act": "act"}
     presets = PRESETS
     config: OpenVLADialectConfig
+
+    def read(self, theirs: Any) -> tuple[Obs, str | None]:
+        """Convert a client's observation, which needs an instruction if the mapping has a key for it."""
+        obs, instruction = super().read(theirs)
+        if instruction is None and self.mapping.instruction is not None:
+            raise InvalidObservation("instruction: got none, the policy needs one; send it with the observation")
+        return obs, instruction
 
     async def act(self, http: HttpRequest) -> Response:
         """Answer one request; the reply is encoded once or twice, like the request."""
