@@ -98,9 +98,9 @@ def _write(name: str, kind: Literal["policy", "env", "dialect", "plugin"]) -> No
     names = {"name": name, "title": "".join(word.title() for word in name.split("_"))}
     templates = files(__package__ or "") / "skeletons" / kind
     texts = {}
-    for path, source in _FILES[kind].items():
+    for file, source in _FILES[kind].items():
         template = (templates / f"{source}.template").read_text("utf-8")
-        texts[Path(Template(path).substitute(names))] = Template(template).substitute(names)
+        texts[Path(Template(file).substitute(names))] = Template(template).substitute(names)
     if there := [str(path) for path in texts if path.exists()]:
         raise ConfigError(f"{', '.join(there)}: there already, and nothing was written; choose another NAME")
     if importlib.util.find_spec(name) is not None:
