@@ -107,8 +107,8 @@ def _write(name: str, kind: Literal["policy", "env", "dialect", "plugin"]) -> No
         raise ConfigError(f"NAME: {name!r} is a module that is installed, and yours would hide it; choose another one")
     for path, text in texts.items():
         path.parent.mkdir(parents=True, exist_ok=True)
-        with path.open("x") as file:
-            file.write(text)
+        with path.open("x") as written:
+            written.write(text)
     out.print(f"wrote {', '.join(map(str, texts))}. Next, in this folder:")
     if kind != "plugin":
         _print_steps((f"{as_typed('python')} test_{name}.py", "checks it; so does pytest"))
