@@ -193,13 +193,16 @@ class _Run:
                             if not pool.busy and not (len(self._queue) and self._deadline.leaves_room):
                                 break
                             self._poll_pool(pool, stop)
+                        if not stop.is_set():
+                            pool.close()
+                    except KeyboardInterrupt:  # a signal during a call in this process
+                        if not stop.is_set():
+                            raise
                     except VLAgentsError as error:
                         if isinstance(error, StorageFailed) or not stop.wait(SIGNAL_S):
                             raise
                         log.info("a part of the evaluation that the signal ended, too, reported: %s", error)
                     state = OutOfTime.why if len(self._queue) or pool.busy else "complete"
-                    if not stop.is_set():
-                        pool.close()
                     if stop.is_set():
                         state = EvaluationInterrupted.why
                     return state, conclude(self.config, self.store, state)

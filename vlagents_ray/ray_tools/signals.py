@@ -90,3 +90,29 @@ def stop_signals() -> Iterator[threading.Event]:
     finally:
         for number, handler in before.items():
             signal.signal(number, handler)
+
+
+@contextlib.contextmanager
+def raised_at_once() -> Iterator[None]:
+    """Raise `KeyboardInterrupt` in this thread on a signal within the context, after its handler has run.
+
+    Code that looks at the event of `stop_signals` does so between two calls. A call that lasts needs this, unless it
+    writes results. A signal without a handler keeps its default action.
+    """
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    before = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
+    handlers = {number: handler for number, handler in before.items() if callable(handler)}
+
+    def on_signal(number: int, frame: FrameType | None) -> None:
+        handlers[signal.Signals(number)](number, frame)
+        raise KeyboardInterrupt
+
+    for number in handlers:
+        signal.signal(number, on_signal)
+    try:
+        yield
+    finally:
+        for number, handler in handlers.items():
+            signal.signal(number, handler)

@@ -19,6 +19,7 @@ from vlagents_ray.evaluate.plan.jobs import Job
 from vlagents_ray.evaluate.workers.base import VARIABLES, WorkerHandle, Workers, phase_limits_s
 from vlagents_ray.evaluate.workers.rollout import AgentFactory, Report, Rollout
 from vlagents_ray.ray_tools.session import variables
+from vlagents_ray.ray_tools.signals import raised_at_once
 
 log = logging.getLogger(__name__)
 
@@ -28,7 +29,11 @@ _STACK_LINES = 6  # the innermost three calls
 
 
 class InProcessWorkers(Workers):
-    """One worker, which plays while it is waited for. A call that hangs is reported, but no time limit can end it."""
+    """One worker, which plays while it is waited for.
+
+    A call that hangs is reported, but no time limit can end it. A signal ends it, with `KeyboardInterrupt`: the thread
+    that plays is the one that would look at the event of `stop_signals`.
+    """
 
     def __init__(self, config: EvalConfig, agent_factory: AgentFactory, recorders: RecorderFactory = Recording) -> None:
         super().__init__()
@@ -59,7 +64,7 @@ class InProcessWorkers(Workers):
             jobs, worker.jobs = worker.jobs, ()
             if not jobs:
                 continue
-            with _exits_raised(), _hangs_reported(self._rollout, self._config):
+            with raised_at_once(), _exits_raised(), _hangs_reported(self._rollout, self._config):
                 reports = self._rollout.run(jobs)
             if reports[0].env is not None:
                 worker.env_place = jobs[0].cell.place
@@ -71,7 +76,8 @@ class InProcessWorkers(Workers):
     def close(self) -> None:
         broken, self._rollout = self._rollout, self._make()
         try:
-            broken.close()
+            with raised_at_once():
+                broken.close()
         except VLAgentsError as error:
             log.warning("closing the env: %s", error)
 

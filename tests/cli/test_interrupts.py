@@ -1,0 +1,115 @@
+"""One Ctrl-C or one SIGTERM ends an evaluation, whichever call hangs; finished episodes keep their results."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from eval_fakes import wait_for
+from ray_processes import START_S
+
+END_S = 120.0  # of a command that has been interrupted
+EPISODES, HANGS_AFTER = 4, 2
+MODULE = f"""
+import pathlib, threading
+import numpy as np
+from vlagents_ray import Act, ActionSpec, Agent, Contract, StateSpec
+
+
+def hang():
+    pathlib.Path("hangs").touch()
+    while True:
+        try:
+            threading.Event().wait()
+        except Exception:  # as a client that tries again for ever
+            pass
+
+
+class Policy(Agent):
+    hangs_in, resets = None, 0
+
+    @property
+    def contract(self):
+        return Contract(state={{"xyzrpy": StateSpec(6, "m+rad")}}, action=ActionSpec(dim=4, delta=True))
+
+    def initialize(self):
+        if self.hangs_in == "initialize":
+            hang()
+
+    def reset(self, obs, instruction, **options):
+        Policy.resets += 1
+        self.is_last = Policy.resets > {HANGS_AFTER}
+        if self.is_last and self.hangs_in == "reset":
+            hang()
+        return {{}}
+
+    def act(self, obs):
+        if self.is_last and self.hangs_in == "act":
+            hang()
+        return Act(np.zeros((1, 4), np.float32))
+
+    def close(self):
+        if self.hangs_in == "close":
+            hang()
+
+
+class Initialize(Policy):
+    hangs_in = "initialize"
+
+
+class Reset(Policy):
+    hangs_in = "reset"
+
+
+class Acting(Policy):
+    hangs_in = "act"
+
+
+class Close(Policy):
+    hangs_in = "close"
+"""
+WITH_RAY = [pytest.mark.ray, pytest.mark.slow]
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize(
+    ("policy", "workers", "finished"),
+    [
+        ("Initialize", "0", 0),
+        ("Reset", "0", HANGS_AFTER),
+        ("Acting", "0", HANGS_AFTER),
+        ("Close", "0", EPISODES),
+        pytest.param("Acting", "1", HANGS_AFTER, marks=WITH_RAY),
+    ],
+)
+def test_one_signal_ends_an_evaluation_that_hangs(
+    policy: str, workers: str, finished: int, number: signal.Signals, tmp_path: Path
+) -> None:
+    (tmp_path / "own.py").write_text(MODULE)
+    options = f"--episodes {EPISODES} --env-set max_steps=2 --video none --workers {workers} --out out".split()
+    evaluation = subprocess.Popen(
+        [sys.executable, "-m", "vlagents_ray", "eval", "tabletop", "--policy", f"own:{policy}", *options],
+        cwd=tmp_path,
+        env=os.environ | {"PYTHONPATH": os.pathsep.join([str(tmp_path), *sys.path])},
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        text=True,
+    )
+    with evaluation:
+        try:
+            wait_for(lambda: (tmp_path / "hangs").exists() or evaluation.poll() is not None, START_S)
+            evaluation.send_signal(number)
+            printed, _ = evaluation.communicate(timeout=END_S)
+        finally:
+            evaluation.kill()
+    assert evaluation.returncode == 130, printed
+    assert "Traceback" not in printed
+    [error] = [line for line in printed.splitlines() if line.startswith("error ")]
+    assert error == f"error interrupted after {finished} of {EPISODES} episodes; go on with --resume --out out"
+    summary = json.loads((tmp_path / "out" / "summary.json").read_text())
+    assert (summary["state"], summary["totals"][0]["episodes"]) == ("interrupted", finished)
