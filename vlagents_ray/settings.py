@@ -14,7 +14,8 @@ import numpy as np
 from vlagents_ray.errors import ConfigError, shown
 from vlagents_ray.naming import did_you_mean
 
-_WORD_ERRORS = ("int_parsing", "float_parsing", "bool_parsing", "list_type")
+_BOUNDS = ("less_than", "less_than_equal", "greater_than", "greater_than_equal")
+_WORD_ERRORS = ("int_parsing", "float_parsing", "bool_parsing", "list_type", *_BOUNDS)
 # How to write a value, by the type of error and the type of the value.
 _SPELLINGS = {
     ("list_type", dict): "; begin each of its entries with '- '",

@@ -183,11 +183,19 @@ COMMANDS: dict[str, tuple[list[str], list[str]]] = {
     "serve: no keys": (["serve", "noop", "--host", "0.0.0.0"], ["keys new", "--insecure"]),  # noqa: S104
     "serve: keys file absent": (["serve", "noop", "--keys", "nope.json"], ["nope.json", "keys new"]),
     "serve: half of TLS": (["serve", "noop", "--tls-cert", "x.pem"], ["--tls-key"]),
-    "serve: text for a port": (["serve", "noop", "--port", "http"], ["--port"]),
-    "key: expired before": (["keys", "new", "x", "--days", "-5"], ["--days", "0.001"]),
+    "serve: text for a port": (["serve", "noop", "--port", "80x"], ["--port", "got '80x', want a valid integer"]),
+    "serve: port beyond the last": (["serve", "noop", "--port", "99999"], ["--port", "got '99999'", "65535"]),
+    "serve: a module's file": (["serve", "own.py"], ["'own:MyPolicy'", "'own.py'"]),
+    "serve: a module": (["serve", "own"], ["'own:MyPolicy'"]),
+    "serve: a module by its path": (["serve", "./own.py"], ["'own:MyPolicy'"]),
+    "serve: a folder": (["serve", "."], ["deployment file (.yaml)", "folder '.'"]),
+    "eval: a module's file": ([*EVAL, "own.py"], ["'own:MyPolicy'"]),
+    "key: expired before": (["keys", "new", "x", "--days", "-5"], ["--days", "got '-5'", "0.001"]),
     "key: expired at once": (["keys", "new", "x", "--days", "0"], ["--days", "0.001"]),
     "key: name": (["keys", "new", "a b"], ["'a b'", "letters"]),
     "key: rate": (["keys", "new", "x", "--rate", "0"], ["--rate", "0.001"]),
+    "keys: a folder": (["keys", "list", "--keys", "."], ["expected a key file", "folder .", "keys.json"]),
+    "key: a folder": (["keys", "new", "x", "--keys", "."], ["expected a key file", "folder ."]),
     "key: scope": (["keys", "new", "x", "--scope", "wach"], ["'wach'", "did you mean 'watch'"]),
     "key: rank": (["keys", "new", "x", "--rank", "simulaton"], ["did you mean 'simulation'"]),
     "key: revoke without a file": (["keys", "revoke", "x"], ["keys new"]),
@@ -206,7 +214,21 @@ COMMANDS: dict[str, tuple[list[str], list[str]]] = {
     "export: kind": (["export", "nowhere", "--out", "x.csv", "--to", "xlsx"], ["'xlsx'", "csv"]),
     "export: folder": (["export", "nowhere", "--out", "no/x.csv", "--to", "csv"], ["no", "make it first"]),
     "bundle: folder": (["bundle", "nowhere", "--out", "no/x.zip"], ["no/x.zip", "make it first"]),
+    "export: a folder as the file": (["export", "done", "--to", "csv", "--out", "."], ["expected a file", "folder"]),
+    "bundle: a folder as the file": (["bundle", "done", "--out", "."], ["expected a file", "folder"]),
     "verify: a text": (["verify", "own.py"], ["own.py"]),
+    "verify: a folder": (["verify", "."], [".: expected a bundle", "got a folder"]),
+    "verify: results": (["verify", "done"], ["got a folder of results", "`vlagents-ray bundle done`"]),
+    "verify: nothing": (["verify", "nowhere"], ["nowhere", "got no file"]),
+    "merge: a folder twice": (["merge", "done", "./done/", "--out", "m"], ["done: is named twice"]),
+    "merge: a folder by a link": (["merge", "done", "link", "--out", "m"], ["link: is named also as done"]),
+    "report: a folder twice": (["report", "done", "done"], ["done: is named twice"]),
+    "demo: a file": (["demo", "--out", "own.py"], ["own.py: expected a folder, got a file"]),
+    "doctor: no such Python": (["doctor", "--python", "nowhere"], ["--python", "nowhere", ".venv-lerobot/bin/python"]),
+    "doctor: an environment's folder": (["doctor", "--python", "venv"], ["a folder; did you mean venv/bin/python?"]),
+    "env make: a module": (["env", "make", "own.py", "--out", "e"], ["own.py", "requirements file"]),
+    "replay: nothing there": (["replay", "nowhere"], ["nowhere", "results.db"]),
+    "replay: no episode": (["replay", "done"], ["got no episode, want a key as ['tabletop#0@0:"]),
     "replay: no policy": (["replay", "dataset"], ["--policy"]),
     "replay: episodes": (["replay", "dataset", "--policy", "noop", "--only", "a-b"], ["'a-b'", "0-9,12"]),
 }
@@ -224,8 +246,17 @@ EPISODES = {
 }
 
 
+@pytest.fixture(scope="module")
+def results(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("results") / "done"
+    options = ["--episodes", "1", "--workers", "0", "--video", "none", "--env-set", "max_steps=2", "--out", str(path)]
+    done = CliRunner().invoke(app, ["eval", "tabletop", "--policy", "scripted", *options])
+    assert done.exit_code == 0, done.output
+    return path
+
+
 @pytest.fixture(autouse=True)
-def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+def folder(tmp_path: Path, results: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     monkeypatch.chdir(tmp_path)
     monkeypatch.syspath_prepend(tmp_path)
     monkeypatch.delitem(sys.modules, "own", raising=False)
@@ -237,6 +268,10 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
         (tmp_path / name / "results.db").write_text(text)
     (tmp_path / "dataset" / "meta").mkdir(parents=True)
     (tmp_path / "dataset" / "meta" / "info.json").write_text("{}")
+    (tmp_path / "done").symlink_to(results)
+    (tmp_path / "link").symlink_to(results)
+    (tmp_path / "venv/bin").mkdir(parents=True)
+    (tmp_path / "venv/bin/python").touch()
     key = {"name": "arm-1", "sha256": "0" * 64}
     (tmp_path / "k.json").write_text(json.dumps({"keys": [key]}))
     return tmp_path

@@ -576,7 +576,9 @@ ARM = ["--robot", SIMULATED]
         (["--robots=x:Y"], "--robots=x:Y; did you mean '--robot'"),
         (["--recrd", "x"], "did you mean '--record'"),
         (["--1234567"], "unrecognized arguments: --1234567; --help lists the options"),
-        (["--ca", "x"], "unrecognized arguments: --ca x; --help lists the options"),
+        (["--ca", "x"], "read from a variable: export SSL_CERT_FILE=ca.pem"),
+        (["--cacert=x"], "read from a variable: export SSL_CERT_FILE=ca.pem"),
+        (["--api-key", "vlr_secret"], "read from a variable: export VLAGENTS_RAY_API_KEY=vlr_...\n$"),
         (["--robot-set", "foo=1"], "--robot-set without --robot; name the robot"),
         (["--robot", "{here}:FaultyArn"], "has no 'FaultyArn'; did you mean 'FaultyArm'"),
         (["--robot", "json:Armature"], "has no 'Armature'; write the name of a class"),
@@ -615,6 +617,7 @@ ARM = ["--robot", SIMULATED]
         (["--leader", "builtins:dict"], "lacks engaged, action"),
         (["--leader", "broken_syntax:Leader"], "SyntaxError"),
         (["--measure", "elbow", *ARM, "--max-step", "1"], "elbow"),
+        (["--measure", "jonts", *ARM], "--measure: got 'jonts', want a part of the robot's state, one of .*'joints'"),
     ],
 )
 @pytest.mark.usefixtures("served")

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import argparse
 import contextlib
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from types import MappingProxyType
 from typing import Any
 
 from vlagents_ray.naming import did_you_mean
@@ -39,10 +40,19 @@ def one_of(*names: str) -> dict[str, Any]:
     return {"type": read, "metavar": f"{{{','.join(names)}}}"}
 
 
-def parse_all(parser: argparse.ArgumentParser, arguments: Sequence[str]) -> argparse.Namespace:
-    """Parse the arguments; the process ends with status 2 and a suggestion if one of them is unknown."""
+def parse_all(
+    parser: argparse.ArgumentParser, arguments: Sequence[str], cures: Mapping[str, str] = MappingProxyType({})
+) -> argparse.Namespace:
+    """Parse the arguments; the process ends with status 2 and a suggestion if one of them is unknown.
+
+    `cures` are those of options that users expect and that do not exist.
+    """
     options, unknown = parser.parse_known_args(arguments)
     if unknown:
+        names = (word.partition("=")[0] for word in unknown)
+        cure = next((cures[name] for name in names if name in cures), None)
+        if cure is not None:
+            parser.error(cure)
         words = parser.format_help().replace(",", " ").split()
         known = [word.removeprefix("--") for word in words if word.startswith("--")]
         meant = [word.lstrip("-").partition("=")[0] for word in unknown if word.startswith("-")]

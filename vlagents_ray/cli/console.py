@@ -122,7 +122,12 @@ def require_folder_of(file: Path) -> None:
 
 
 def fresh(folder: Path) -> Path:
-    """Return `folder`, or the first of folder-2, folder-3, … that does not exist, so that results never mix."""
+    """Return `folder`, or the first of folder-2, folder-3, … that does not exist, so that results never mix.
+
+    Raises `ConfigError` if it is a file.
+    """
+    if folder.is_file():
+        raise ConfigError(f"{folder}: expected a folder, got a file; choose another name")
     numbered = (folder.with_name(f"{folder.name}-{number}") for number in itertools.count(2))
     return next(one for one in itertools.chain([folder], numbered) if not one.exists())
 

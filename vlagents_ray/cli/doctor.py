@@ -23,7 +23,7 @@ from rich.console import Console
 from rich.text import Text
 
 from vlagents_ray.cli.console import print_json, table
-from vlagents_ray.errors import MissingDependency
+from vlagents_ray.errors import ConfigError, MissingDependency
 from vlagents_ray.policies.base.accelerator import OLDEST_DRIVERS, driver_version
 from vlagents_ray.registry import require
 from vlagents_ray.serve.python_env.create import has_gpu
@@ -174,7 +174,12 @@ def port_free(port: int) -> Check:
 
 
 def run(console: Console, port: int = DEFAULT_PORT, pythons: Sequence[Path] = (), *, as_json: bool = False) -> int:
-    """Print a row for each check, see `checks`. Returns the exit code: 1 if any check failed, else 0."""
+    """Print a row for each check, see `checks`. Returns the exit code: 1 if any check failed, else 0.
+
+    Raises `ConfigError` if one of `pythons` is no program.
+    """
+    for interpreter in pythons:
+        _require_program(interpreter)
     with console.status("looking around; rendering a frame takes some seconds"):
         found = list(checks(port, pythons))
     if as_json:
@@ -185,6 +190,17 @@ def run(console: Console, port: int = DEFAULT_PORT, pythons: Sequence[Path] = ()
             rows.add_row(name, Text(check.status, _STYLE[check.status]), Text(check.detail), Text(check.cure))
         console.print(rows, width=None if console.is_terminal else _WIDTH)
     return int(any(check.status == "fail" for _, check in found))
+
+
+def _require_program(interpreter: Path) -> None:
+    if interpreter.is_file() and os.access(interpreter, os.X_OK):
+        return
+    what = "a folder" if interpreter.is_dir() else "no program"
+    cure = f"; did you mean {interpreter / 'bin/python'}?" if (interpreter / "bin/python").exists() else ""
+    raise ConfigError(
+        f"--python: expected the interpreter of an environment, such as .venv-lerobot/bin/python, got {interpreter}, "
+        f"which is {what}{cure}"
+    )
 
 
 def checks(port: int = DEFAULT_PORT, pythons: Sequence[Path] = ()) -> Iterator[tuple[str, Check]]:
@@ -204,8 +220,9 @@ def checks(port: int = DEFAULT_PORT, pythons: Sequence[Path] = ()) -> Iterator[t
     for name, check in todo:
         yield name, guarded(check)
     made = [*sorted(Path().glob(".venv-*/bin/python")), *Path("/opt/family/bin").glob("python")]
-    for interpreter in [Path(sys.executable), *(pythons or made)]:
-        yield from libraries(interpreter)
+    yield from libraries(Path(sys.executable))
+    for interpreter in pythons or made:
+        yield from libraries(interpreter, status="fail" if pythons else "warn")
 
 
 def guarded(check: Callable[[], Check]) -> Check:
@@ -275,12 +292,15 @@ def python_version() -> Check:
     return Check("warn", f"{found}; servers are tested with Python {wanted}", f"make an environment of Python {wanted}")
 
 
-def libraries(python: Path) -> Iterator[tuple[str, Check]]:
-    """Yield names and results of the checks of an interpreter: of torch, JAX and Triton's compiler, if it has them."""
+def libraries(python: Path, status: Literal["warn", "fail"] = "warn") -> Iterator[tuple[str, Check]]:
+    """Yield names and results of the checks of an interpreter: of torch, JAX and Triton's compiler, if it has them.
+
+    `status` is that of an interpreter that does not run.
+    """
     where = "" if str(python) == sys.executable else f" in {python.parent.parent}"
     answer = _output([str(python), "-c", _LIBRARIES])
     if answer.returncode != 0:
-        yield f"Python{where}", Check("warn", _last_line(answer.stderr), "make it again: vlagents-ray env make")
+        yield f"Python{where}", Check(status, _last_line(answer.stderr), "make it again: vlagents-ray env make")
         return
     found = json.loads(_last_line(answer.stdout))
     driver = driver_version() if has_gpu() else None

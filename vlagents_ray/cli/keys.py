@@ -80,7 +80,12 @@ def revoke_(name: Name, file: File = None) -> None:
 
 
 def _file(file: Path | None) -> Path:
-    return file or Path(os.environ.get(FILE_VARIABLE) or "keys.json")
+    place = file or Path(os.environ.get(FILE_VARIABLE) or "keys.json")
+    if place.is_dir():
+        raise ConfigError(
+            f"--keys: expected a key file, got the folder {place}; add its name, as {place / 'keys.json'}"
+        )
+    return place
 
 
 def _existing(file: Path | None) -> Path:

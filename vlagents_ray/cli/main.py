@@ -16,7 +16,7 @@ from vlagents_ray.cli.console import errors, fail, fresh, out, print_json, progr
 from vlagents_ray.cli.evaluate import evaluate_command
 from vlagents_ray.cli.keys import keys
 from vlagents_ray.cli.new import new
-from vlagents_ray.cli.options import AsJson
+from vlagents_ray.cli.options import AsJson, Commands
 from vlagents_ray.cli.serve import serve_command
 from vlagents_ray.errors import VLAgentsError
 from vlagents_ray.naming import did_you_mean
@@ -28,6 +28,7 @@ if TYPE_CHECKING:
 OneName = Annotated[str | None, typer.Argument(metavar="[NAME]", help="Say all about this one alone.")]
 
 app = typer.Typer(
+    cls=Commands,
     no_args_is_help=True,
     add_completion=False,
     pretty_exceptions_enable=False,
@@ -98,7 +99,9 @@ def doctor(
     """Check this machine: Python, Ray, GPU, torch, JAX, rendering, shared memory, ports; each with the cure."""
     from vlagents_ray.cli.doctor import run
 
-    raise typer.Exit(run(out, port, python, as_json=as_json))
+    with errors():
+        status = run(out, port, python, as_json=as_json)
+    raise typer.Exit(status)
 
 
 # With lines that fit into 80 columns, so that all commands are on one screen.

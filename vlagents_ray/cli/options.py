@@ -13,8 +13,11 @@ from pathlib import Path
 from typing import Annotated, Any, TypeVar, get_type_hints
 
 import typer
+from pydantic import ValidationError
+from typer.core import TyperGroup
 
 from vlagents_ray.errors import ConfigError
+from vlagents_ray.settings import wrong_settings
 from vlagents_ray.yaml_text import load_yaml, read_yaml
 
 YAML_SUFFIXES = (".yaml", ".yml")
@@ -67,6 +70,18 @@ def command_of(options: type[_Options]) -> Callable[[Callable[[_Options], None]]
         return called
 
     return decorate
+
+
+class Commands(TyperGroup):
+    """The group of all commands, whose errors name the value of an option that cannot be read."""
+
+    def invoke(self, ctx: Any) -> Any:
+        try:
+            return super().invoke(ctx)
+        except typer.BadParameter as error:
+            if isinstance(error.__cause__, ValidationError):  # its message lacks the value
+                error.message = wrong_settings(error.__cause__)
+            raise
 
 
 def finite(value: float | None) -> float | None:

@@ -236,8 +236,6 @@ def replay_command(
             plan = ReplayPlan(None if only is None else parse_episodes(only), horizon, every, at_once, names)
             replay_dataset(folder, policy, out_dir or fresh(Path("runs/replay")), plan)
             return
-        if episode is None:
-            raise ConfigError(f"{folder}: holds results, and wants an episode: its key, or ENV#NUMBER")
         from vlagents_ray.cli.evaluation import play_one
         from vlagents_ray.evaluate import Results
         from vlagents_ray.evaluate.replay import actions_difference, compare, find

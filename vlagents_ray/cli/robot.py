@@ -63,6 +63,10 @@ KEYS = (
     "keys: p pauses and continues; y (success), n (failure), x (discard) and q end the run and stop the robot; "
     "c or Enter restarts it after a stop"
 )
+# Of options that other programs have. An option with a key would be readable in the list of processes.
+_OF_KEYS = "the API key is read from a variable: export VLAGENTS_RAY_API_KEY=vlr_..."
+_OF_CAS = "the file of your CA is read from a variable: export SSL_CERT_FILE=ca.pem"
+_CURES = {"--api-key": _OF_KEYS, "--key": _OF_KEYS, "--ca": _OF_CAS, "--cacert": _OF_CAS, "--tls-ca": _OF_CAS}
 RESTART_KEYS = "c\n"  # without Enter while the keyboard moves the robot
 _HEADER = ("", "ticks", "missed", "within 2 ms", "p50 ms", "p99 ms", "max ms")
 
@@ -95,7 +99,7 @@ def main(arguments: Sequence[str]) -> int:
 def parse(arguments: Sequence[str]) -> argparse.Namespace:
     """Parse the arguments; the process ends with status 2 if they are inconsistent."""
     parser, of_robot, of_env = command_parser()
-    options = parse_all(parser, arguments)
+    options = parse_all(parser, arguments, _CURES)
     in_env = options.env is not None
     refused = of_robot if in_env else of_env
     given = [one.option_strings[0] for one in refused if getattr(options, one.dest) != one.default]
@@ -169,6 +173,7 @@ def _run(options: argparse.Namespace) -> LoopReport:
         player.initialize()  # refuses unfit settings before anything is timed or moves
         make_robot = make_robot or partial(SimulatedRobot, contract)
         robot: Robot = topics or stack.enter_context(opened(make_robot))
+        _require_part(options.measure, robot)
         fit = _require_fit(options, agent, robot, guard.limits, say)
         recorder = None
         if options.record:
@@ -204,6 +209,18 @@ def _run(options: argparse.Namespace) -> LoopReport:
     if ended is not None:
         raise ended
     return report
+
+
+def _require_part(part: str | None, robot: Robot) -> None:
+    """Raise `ConfigError`, before the robot moves, if --measure names a part that its state does not have."""
+    if part is None:
+        return
+    state = robot.observe().state
+    if part not in state:
+        raise ConfigError(
+            f"--measure: got {part!r}, want a part of the robot's state, one of {sorted(state)}"
+            f"{did_you_mean(part, state)}"
+        )
 
 
 def _require_fit(

@@ -119,6 +119,16 @@ def _member(name: str, how: int = zipfile.ZIP_DEFLATED) -> zipfile.ZipInfo:
     return member
 
 
+def _require_file(archive: Path) -> None:
+    if (archive / DATABASE).is_file():
+        raise ConfigError(
+            f"{archive}: expected a bundle, got a folder of results; `vlagents-ray bundle {archive}` writes its bundle"
+        )
+    if not archive.is_file():
+        what = "a folder" if archive.is_dir() else "no file"
+        raise ConfigError(f"{archive}: expected a bundle, a file that `vlagents-ray bundle` wrote, got {what}")
+
+
 def unpack(archive: Path, folder: Path, *, most_bytes: int = MOST_BYTES) -> tuple[Manifest, str, list[str]]:
     """Write the files of a bundle into `folder`, without its manifest.
 
@@ -128,8 +138,7 @@ def unpack(archive: Path, folder: Path, *, most_bytes: int = MOST_BYTES) -> tupl
     Raises:
         ConfigError: The file is no bundle, or is larger than allowed, or has a name that leads out of `folder`.
     """
-    if not archive.is_file():
-        raise ConfigError(f"{archive}: got no file, want a bundle that `vlagents-ray bundle` wrote")
+    _require_file(archive)
     try:
         with zipfile.ZipFile(archive) as file:
             members = _checked(archive, file, most_bytes)
@@ -321,6 +330,7 @@ def verify(
     """
     if into is not None and into.exists():
         raise ConfigError(f"{into}: is there already; want a new folder")
+    _require_file(bundle)
     if seed is None:
         seed = secrets.randbits(32)
     parent = None if into is None else into.absolute().parent

@@ -7,7 +7,7 @@ import json
 import os
 import sqlite3
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from contextlib import closing
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
@@ -72,6 +72,7 @@ def merge(out: Path, folders: Sequence[Path], *, keep_first: bool = False, accep
     """
     if (out / FILE).exists():
         raise ConfigError(f"{out}: has results; merge into a new folder, and name this one among those to be merged")
+    _require_distinct(folders)
     merged = _Merged()
     conflicts: list[str] = []
     for folder in folders:
@@ -237,6 +238,16 @@ def _link_files(merged: _Merged, out: Path, folders: Sequence[Path]) -> None:
         storage.link_or_copy(source, target)
 
 
+def _require_distinct(folders: Iterable[Path]) -> None:
+    """Raise `ConfigError` if one folder is named twice, possibly by other paths."""
+    paths: dict[Path, Path] = {}
+    for folder in folders:
+        first = paths.setdefault(folder.resolve(), folder)
+        if first is not folder:
+            also = "twice" if str(first) == str(folder) else f"also as {first}"
+            raise ConfigError(f"{folder}: is named {also}; name each folder once")
+
+
 def combined(folders: Sequence[Results]) -> Results:
     """Combine the results of several folders.
 
@@ -250,6 +261,7 @@ def combined(folders: Sequence[Results]) -> Results:
         raise ConfigError("report: got no folder, want one or more that evaluations wrote their results to")
     if len(folders) == 1:
         return folders[0]
+    _require_distinct(each.out for each in folders)
     seen: dict[str, Path] = {}
     for each in folders:
         for cell in each.cells:

@@ -75,10 +75,10 @@ class Recorded:
         return EvalConfig.model_validate(config.model_dump() | alone | {"video": "all", "record": "all", "track": []})
 
 
-def find(results: Results, name: str) -> Recorded:
+def find(results: Results, name: str | None) -> Recorded:
     """Find the episode with the key `name`, or the only one with number N in an env, as "ENV#N".
 
-    Raises `ConfigError` if there is none, if there are several, or if it failed by infrastructure.
+    Raises `ConfigError` if no name is given, if there is none, if there are several, or if it failed by infrastructure.
     """
     found = [
         Recorded(results, cell, one)
@@ -88,7 +88,8 @@ def find(results: Results, name: str) -> Recorded:
     ]
     if not found:
         have = [one.result.full_key for cell in results.cells for one in cell.episodes][:_FEW]
-        raise ConfigError(f"{results.out}: has no episode {name!r}, want a key as {have}, or ENV#NUMBER")
+        got = "got no episode" if name is None else f"has no episode {name!r}"
+        raise ConfigError(f"{results.out}: {got}, want a key as {have}, or ENV#NUMBER")
     if len(found) > 1:
         keys = [f"{one.episode.result.full_key} ({one.cell.contender})" for one in found]
         raise ConfigError(f"{name!r} stands for {len(found)} episodes; want one of the keys {keys}")

@@ -30,6 +30,7 @@ def asked(monkeypatch: pytest.MonkeyPatch) -> list[str]:
 
     real = making._uv
     monkeypatch.setattr(making, "_uv", uv)
+    monkeypatch.setattr(making, "plugin_distributions", list)  # those of this environment would be another call
     return told
 
 
@@ -51,6 +52,22 @@ def test_it_holds_this_package_with_the_same_ray_and_the_requirements(
         f"--requirement {requirements}",
     ):
         assert word in asked[-1]
+
+
+def test_one_that_cannot_be_filled_is_removed_unless_it_was_there(
+    monkeypatch: pytest.MonkeyPatch, requirements: Path, tmp_path: Path
+) -> None:
+    def fails(_python: Path, _wanted: Sequence[str]) -> None:
+        raise ConfigError("uv pip failed")
+
+    monkeypatch.setattr(making, "install", fails)
+    existing, new = tmp_path / "existing", tmp_path / "new"
+    python = create(existing)
+    for folder in (existing, new):
+        with pytest.raises(ConfigError, match="uv pip failed"):
+            make_environment(requirements, folder, cuda=True)
+    assert python.exists()
+    assert not new.exists()
 
 
 def test_a_light_one_and_one_of_another_python_are_without_ray(

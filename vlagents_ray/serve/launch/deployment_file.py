@@ -101,11 +101,16 @@ def read_deployment(
         return _checked(read_yaml(path), source, step_follows)
     entry = find_entry("policies", source)
     if ":" not in source and entry is None:
+        module = ".".join(path.parts).removesuffix(".py")
+        if path.name and path.with_suffix(".py").is_file():
+            raise UnknownPolicy(f"policy: expected a class, such as '{module}:MyPolicy', got the module {source!r}")
         if "/" in source:
             raise UnknownPolicy(
                 f"policy: got {source!r}, want a policy or a deployment file; for a checkpoint, give the file of its "
                 f"family, as in deployments/lerobot.yaml --set checkpoint={source}"
             )
+        if path.is_dir():
+            raise UnknownPolicy(f"policy: expected a policy or a deployment file (.yaml), got the folder {source!r}")
         policy_class(source)  # raises an error with the list of choices
     args = dict(overrides or {})
     if entry is not None and entry.weights and "checkpoint" not in args.get("config", {}):

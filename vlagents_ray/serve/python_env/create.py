@@ -127,15 +127,29 @@ def make_environment(
 
     Raises:
         ConfigError: A file or the Python does not exist, uv fails, or a CUDA build would be installed without an NVIDIA
-            GPU.
+            GPU. A folder that this call created is removed.
     """
     files = [requirements, *more]
     for file in files:
         if not file.is_file():
             raise ConfigError(f"no such file: got {str(file)!r}, want a requirements file")
+        if file.suffix == ".py":
+            raise ConfigError(f"{file}: expected a requirements file, such as needs.txt, got a module of Python")
     if python is None and not python_in(folder).exists() and (wanted := _PYTHON.search(requirements.read_text())):
         python = find_python(wanted[1])
+    is_new = not python_in(folder).exists()
     made = create(folder, python, progress)
+    try:
+        _fill(made, files, light=light, cuda=cuda, progress=progress)
+    except BaseException:
+        if is_new:  # otherwise it would later be taken for a complete environment
+            shutil.rmtree(folder)
+        raise
+    return made
+
+
+def _fill(made: Path, files: Sequence[Path], *, light: bool, cuda: bool, progress: Progress) -> None:
+    """Install this package, the plug-ins and the requirements in `files` for a Python; see `make_environment`."""
     if not light and (theirs := _minor(made)) != (ours := _minor(Path(sys.executable))):
         progress(f"Python {theirs} is not this one's {ours}: without Ray, for a child process")
         light = True
@@ -145,17 +159,16 @@ def make_environment(
         if has_gpu():
             asked += _for_driver(Path(scratch), progress)
         else:
-            for override in _overrides(requirements, Path(scratch)):
+            for override in _overrides(files[0], Path(scratch)):
                 asked += ["--override", str(override)]
             if not cuda:
                 require_no_cuda(made, asked)
-        progress(f"installing {_US} {importlib.metadata.version(_US)} and {requirements}")
+        progress(f"installing {_US} {importlib.metadata.version(_US)} and {files[0]}")
         install(made, asked)
         plugins = _plugins(Path(scratch))
         if plugins:
             install(made, ["--no-deps", *plugins])
     _install_import_fixes(made)
-    return made
 
 
 def _ourselves(light: bool, scratch: Path) -> list[str]:
