@@ -8,6 +8,7 @@ from __future__ import annotations
 import contextlib
 import fcntl
 import hashlib
+import itertools
 import json
 import os
 import socket
@@ -23,6 +24,7 @@ from functools import cache, partial
 from pathlib import Path
 from typing import Any
 
+import grpc
 import hostile_images
 import numpy as np
 import rpyc_client
@@ -47,6 +49,7 @@ from vlagents_ray.registry import dialect_class
 from vlagents_ray.serve.access.api_keys import Keys, NoKey
 from vlagents_ray.serve.config.dialects import DialectArgs
 from vlagents_ray.serve.dialects import gr00t, vlagents
+from vlagents_ray.serve.dialects import lerobot as lerobot_dialect
 from vlagents_ray.serve.dialects.base import GatewayContext, ReplicaContext, dialect_routes
 from vlagents_ray.serve.endpoints.access_middleware import AccessMiddleware
 from vlagents_ray.serve.endpoints.front import FrontMiddleware
@@ -57,7 +60,7 @@ from vlagents_ray.serve.engine.admission import Admission
 from vlagents_ray.serve.engine.engine import Engine
 from vlagents_ray.serve.ports import reserve
 from vlagents_ray.wire import gr00t as gr00t_wire
-from vlagents_ray.wire import json_numpy, rpyc, zmtp
+from vlagents_ray.wire import json_numpy, lerobot, rpyc, zmtp
 from vlagents_ray.wire import openpi as openpi_codec
 from vlagents_ray.wire import vla_eval as vla_eval_codec
 
@@ -113,7 +116,7 @@ def serve_gateways() -> None:
     rated = [_key(key_of(way), rate=1, rank="simulation") for way in GATEWAYS]
     keys = Keys.from_text(json.dumps({"keys": [_key("robot"), *rated]}))
     limits = Limits()
-    gr00t._MESSAGE_S = vlagents._FRAME_S = SLOW_S
+    gr00t._MESSAGE_S = vlagents._FRAME_S = lerobot_dialect._UPLOAD_S = SLOW_S
     dialects, ports = [], {}
     for name, check in (("gr00t", partial(keys.check, app="app")), ("vlagents", NoKey.OPEN), ("lerobot", NoKey.OPEN)):
         admission = Admission(GATEWAYS_IN_FLIGHT)
@@ -415,7 +418,7 @@ class Behaviour:
     """What a client of a gateway sends over a connection: once, then a part again and again, or byte by byte."""
 
     once: Callable[[str], bytes]  # the first bytes, with a key
-    repeated: bytes = b""
+    repeated: bytes | Callable[[int], bytes] = b""  # a function gets the number of the repetition
     period_s: float = 0.0  # between two of the repeated parts
     waits: bool = True  # whether the client then waits for the end of the connection
 
@@ -434,10 +437,64 @@ _HALF = b"\x02" + struct.pack(">Q", 60 * 2**20) + bytes(50 * 2**20)
 _EMPTY_PARTS = b"\x01\x00" * 2**17
 _ZMQ_PING = b"\x04\x07\x04PING\x00\x00"
 _HTTP2 = b"PRI * HTTP/2.0\r\n\r\nSM\r\n\r\n" + bytes(3) + b"\x04" + bytes(5)  # and empty settings
+_READY = "Ready"
+_OBSERVE = "SendObservations"
+
+
+def _http2_frame(kind: int, flags: int, stream: int, payload: bytes = b"") -> bytes:
+    return len(payload).to_bytes(3, "big") + bytes([kind, flags]) + stream.to_bytes(4, "big") + payload
+
+
+def _grpc_head(stream: int, method: str, *, is_complete: bool = True) -> bytes:
+    """The HEADERS of a request, each as a literal without an index; without its end, another frame must follow."""
+    headers = {
+        ":method": "POST",
+        ":scheme": "http",
+        ":path": f"/{lerobot.SERVICE}/{method}",
+        ":authority": "x",
+        "content-type": "application/grpc",
+        "te": "trailers",
+    }
+    fields = b""
+    for name, value in headers.items():
+        fields += b"\0" + bytes([len(name)]) + name.encode() + bytes([len(value)]) + value.encode()
+    return _http2_frame(1, 4 if is_complete else 0, stream, fields)
+
+
+def _ready(stream: int) -> bytes:
+    """A complete request `Ready`."""
+    return _grpc_head(stream, _READY) + _http2_frame(0, 1, stream, bytes(5))
+
+
+def _readies(repetition: int) -> bytes:
+    """Fifty complete requests, each on its own stream."""
+    return b"".join(_ready(stream) for stream in range(100 * repetition + 1, 100 * repetition + 101, 2))
+
+
+def _part_of_an_observation(repetition: int) -> bytes:
+    """Nothing at first, while `Ready` is answered; then 9 kB of a message of 1 MiB; then nothing."""
+    if repetition != 1:
+        return b""
+    return _grpc_head(3, _OBSERVE) + _http2_frame(0, 0, 3, _GRPC_HALF + bytes(9000))
+
+
+def _bytes_of_an_observation(repetition: int) -> bytes:
+    """The same, and then a byte with each repetition."""
+    return _part_of_an_observation(repetition) if repetition < 2 else _http2_frame(0, 0, 3, b"x")
+
+
+def _cancelled(repetition: int) -> bytes:
+    """Fifty requests that are cancelled at once."""
+    streams = range(100 * repetition + 1, 100 * repetition + 101, 2)
+    return b"".join(_grpc_head(stream, _READY) + _http2_frame(3, 0, stream, bytes(3) + b"\x08") for stream in streams)
+
+
+_GRPC_HALF = b"\0" + struct.pack(">I", 2**20)  # the head of a message of 1 MiB
 _HTTP2_PING = b"\x00\x00\x08\x06" + bytes(13)
 _HTTP2_SETTINGS = b"\x00\x00\x00\x04" + bytes(5)
 _RPYC_HALF = rpyc.HEADER.pack(60 * 2**20, 0) + bytes(50 * 2**20)
 _RPYC_PING = rpyc_client.request(1, rpyc.Handler.PING, (2, ()))
+UPLOADS = "observations without an end"
 _OF_ANY = {
     "nothing": Behaviour(lambda _: b""),
     "closed at once": Behaviour(lambda _: b"", waits=False),
@@ -469,16 +526,41 @@ GATEWAYS: dict[str, dict[str, Behaviour]] = {
         "half a handshake": Behaviour(lambda _: _HTTP2[:10]),
         "a refused handshake": Behaviour(lambda _: b"GET / HTTP/1.1\r\n\r\n"),
         "pings": Behaviour(lambda _: _HTTP2, _HTTP2_PING * 1000),
+        "pings, a few at once": Behaviour(lambda _: _HTTP2, _HTTP2_PING * 100, 0.01),
         "settings": Behaviour(lambda _: _HTTP2, _HTTP2_SETTINGS * 1000),
+        "settings, a few at once": Behaviour(lambda _: _HTTP2, _HTTP2_SETTINGS * 100, 0.01),
+        "requests": Behaviour(lambda _: _HTTP2, _readies),
+        "requests by reconnects": Behaviour(lambda _: _HTTP2 + _readies(0), waits=False),
+        "cancelled requests": Behaviour(lambda _: _HTTP2, _cancelled),
+        "cancelled requests by reconnects": Behaviour(lambda _: _HTTP2 + _cancelled(0), waits=False),
+        "half a head": Behaviour(lambda _: _HTTP2 + _grpc_head(1, _READY, is_complete=False)),
+        "half a message": Behaviour(lambda _: _HTTP2 + _ready(1), _part_of_an_observation, 0.05),
+        "a message byte by byte": Behaviour(lambda _: _HTTP2 + _ready(1), _bytes_of_an_observation, 0.05),
+        UPLOADS: Behaviour(lambda _: b""),
     },
 }
 
 
-OF_GRPC = [("lerobot", "pings"), ("lerobot", "settings")]  # what gRPC's own library reads and answers
+def _upload_without_end(where: Where, end: float) -> None:
+    """Send the parts of the largest observation, but the last, as gRPC's flow control takes them."""
+
+    def parts() -> Iterator[bytes]:
+        for _ in range(16):
+            yield b"\x08\x02\x12" + b"\x80\x80\x80\x01" + bytes(2**21)  # 2 MiB of data, in the middle
+        time.sleep(max(0.0, end - time.monotonic()))
+
+    address = f"127.0.0.1:{where['gateways']['lerobot']}"
+    options = [("grpc.use_local_subchannel_pool", 1)]  # a connection for each channel
+    with grpc.insecure_channel(address, options=options) as channel, contextlib.suppress(grpc.RpcError):
+        channel.unary_unary(f"/{lerobot.SERVICE}/{_READY}")(b"", timeout=10)
+        channel.stream_unary(f"/{lerobot.SERVICE}/{_OBSERVE}")(parts(), timeout=max(0.1, end - time.monotonic()))
 
 
 def misbehave_at_gateway(way: str, name: str, where: Where, end: float) -> None:
     """Behave in that way over one connection, until the gateway ends it, or until the `end`."""
+    if name == UPLOADS:
+        _upload_without_end(where, end)
+        return
     behaviour, key = GATEWAYS[way][name], key_of(way)
     repeated = _gr00t(key, data=bytes(4 * 2**20)) if behaviour.repeated == b"key" else behaviour.repeated
     with socket.create_connection(("127.0.0.1", where["gateways"][way]), timeout=5) as connection:
@@ -486,8 +568,10 @@ def misbehave_at_gateway(way: str, name: str, where: Where, end: float) -> None:
         connection.sendall(behaviour.once(key))
         if repeated:
             threading.Thread(target=_drain, args=(connection,), daemon=True).start()
-            while time.monotonic() < end:
-                connection.sendall(repeated)
+            for repetition in itertools.count():
+                if time.monotonic() >= end:
+                    break
+                connection.sendall(repeated(repetition) if callable(repeated) else repeated)
                 time.sleep(behaviour.period_s)
         elif behaviour.waits:
             _drain(connection)

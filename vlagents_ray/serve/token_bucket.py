@@ -18,11 +18,14 @@ class TokenBucket:
         self._tokens = self._capacity = max(1.0, rate) if capacity is None else capacity
         self._refilled = now
 
-    def take(self, now: float) -> float:
-        """Take a token and return 0 if there is one; otherwise return the time until there is one, s."""
+    def take(self, now: float, number: int = 1) -> float:
+        """Take `number` tokens and return 0 if there are so many; otherwise return the time until there are, s.
+
+        The number must not exceed the capacity.
+        """
         self._tokens = min(self._capacity, self._tokens + (now - self._refilled) * self.rate)
         self._refilled = now
-        if self._tokens < 1:
-            return (1 - self._tokens) / self.rate
-        self._tokens -= 1
+        if self._tokens < number:
+            return (number - self._tokens) / self.rate
+        self._tokens -= number
         return 0.0

@@ -202,7 +202,7 @@ def test_a_compressed_message_is_not_decompressed(open_lerobot) -> None:
 
 def test_an_observation_that_takes_too_long_ends(open_lerobot, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("vlagents_ray.serve.dialects.lerobot._UPLOAD_S", 0.2)
-    monkeypatch.setattr("vlagents_ray.serve.dialects.lerobot._TICK_S", 0.05)
+    monkeypatch.setattr("vlagents_ray.serve.dialects.acceptor.TICK_S", 0.05)
     goes_on = threading.Event()
 
     def slowly() -> Iterator[bytes]:
@@ -220,7 +220,7 @@ def test_an_observation_that_takes_too_long_ends(open_lerobot, monkeypatch: pyte
 
 
 def test_a_client_that_is_gone_loses_its_session(open_lerobot, replicas: Replicas, monkeypatch) -> None:
-    monkeypatch.setattr("vlagents_ray.serve.dialects.lerobot._TICK_S", 0.05)
+    monkeypatch.setattr("vlagents_ray.serve.dialects.acceptor.TICK_S", 0.05)
     port = open_lerobot(idle_s=0.2)
     with AsyncClient(port).begin() as robot:
         robot.act(robot_saw(0))
@@ -251,15 +251,6 @@ def test_no_other_process_shares_the_port(open_lerobot) -> None:
     server = grpc.server(None, options=[("grpc.so_reuseport", 1)])
     with pytest.raises(RuntimeError, match="bind"):
         server.add_insecure_port(f"127.0.0.1:{port}")
-
-
-def test_an_endpoint_for_ipv4_has_no_clients_over_ipv6(open_lerobot, monkeypatch: pytest.MonkeyPatch) -> None:
-    """With the host 0.0.0.0, gRPC also listens on all addresses of IPv6."""
-    port, peer = open_lerobot(), grpc._server._Context.peer
-    monkeypatch.setattr(grpc._server._Context, "peer", lambda self: peer(self).replace("ipv4:", "ipv6:"))
-    with AsyncClient(port) as robot, pytest.raises(grpc.RpcError, match="is for IPv4") as error:
-        robot.begin()
-    assert status_of(error)[0] == "PERMISSION_DENIED"
 
 
 def test_what_is_no_error_of_ours_is_logged_and_not_shown(open_lerobot, caplog, monkeypatch) -> None:

@@ -15,6 +15,7 @@ _READ_BYTES = 256 * 1024  # maximum size of a read
 # Above this size a message is in a mapping, whose pages are taken when they are written, and are returned when it is
 # freed. The heaps of as many threads as there are clients would keep them.
 _MAPPED_BYTES = 256 * 1024
+_KEEP_ALIVE = (("TCP_KEEPIDLE", 20), ("TCP_KEEPINTVL", 5), ("TCP_KEEPCNT", 3), ("TCP_USER_TIMEOUT", 35_000))
 
 
 def share_of(connection: socket.socket) -> str:
@@ -29,6 +30,14 @@ def shut_down(connection: socket.socket, how: int = socket.SHUT_RDWR) -> None:
     """Shut a connection down, which wakes the thread that reads from it."""
     with contextlib.suppress(OSError):
         connection.shutdown(how)
+
+
+def set_keep_alive(connection: socket.socket) -> None:
+    """Let the kernel end a TCP connection whose client's machine no longer answers, after 35 s."""
+    connection.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
+    for name, value in _KEEP_ALIVE:
+        if hasattr(socket, name):
+            connection.setsockopt(socket.IPPROTO_TCP, getattr(socket, name), value)
 
 
 class ClientReader:

@@ -21,8 +21,9 @@ from vlagents_ray.protocol.websocket_frames import CONTROL_FRAMES, CONTROL_FRAME
 from vlagents_ray.registry import require
 from vlagents_ray.serve.access.api_keys import Caller, NoKey
 from vlagents_ray.serve.config.dialects import MappingSetting, PortConfig
+from vlagents_ray.serve.dialects.acceptor import Acceptor
 from vlagents_ray.serve.dialects.base import GatewayContext, PortDialect
-from vlagents_ray.serve.dialects.client_reader import ClientReader, share_of, shut_down
+from vlagents_ray.serve.dialects.client_reader import ClientReader, set_keep_alive, share_of, shut_down
 from vlagents_ray.serve.dialects.gateway_sessions import GatewayClient, GatewayClients, internal_error
 from vlagents_ray.serve.engine.admission import Admission
 from vlagents_ray.serve.token_bucket import TokenBucket
@@ -37,18 +38,15 @@ _FOLDER = re.compile(r"^(video|state|language)\.")
 Envelope = tuple[bytes, ...]
 _ENVELOPES: tuple[Envelope, ...] = ((), (b"",))  # those of clients that are connected directly
 _MOST_PARTS, _MOST_PART_BYTES = 4, 256  # of an envelope that is answered with an error; others end the connection
-_KEEPALIVE = (("TCP_KEEPIDLE", 20), ("TCP_KEEPINTVL", 5), ("TCP_KEEPCNT", 3), ("TCP_USER_TIMEOUT", 35_000))
 _HANDSHAKE_S = 5.0
 _MESSAGE_S = 30.0  # maximum time of a message, from its first byte to its last
 _SEND_S = 10.0  # maximum time for a client to accept an answer
-_TICK_S = 0.5  # period at which idle clients and keys are checked
 _END_S = 3.0  # maximum time for the answers to requests when the dialect ends
 _LINGER_S = 1.0  # and for refusing those that have arrived by then
 _STRANGERS = 64  # maximum number of connections without a valid key; a further one ends the oldest
 _STRANGER_S = 30.0  # time within which a connection must send a valid key
 _REFUSALS = 64  # messages without a valid key after which a connection is closed
 _REFUSAL_S = 0.1  # time for which a connection is not read after such a message, as reading a key takes time
-_ACCEPTED_PER_S = 50.0  # maximum number of connections in a second; each takes a thread and about a millisecond
 
 
 class GR00TConnection(GatewayClient):
@@ -96,10 +94,7 @@ class GR00TConnection(GatewayClient):
     def _run(self) -> None:
         try:
             self._connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-            self._connection.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
-            for name, value in _KEEPALIVE:
-                if hasattr(socket, name):
-                    self._connection.setsockopt(socket.IPPROTO_TCP, getattr(socket, name), value)
+            set_keep_alive(self._connection)
             self._greet()
             while (head := self._receive_head()) is not None:
                 self._process(*head)
@@ -364,10 +359,8 @@ class GR00TDialect(PortDialect):
         self._connections: set[GR00TConnection] = set()
         self._strangers: dict[GR00TConnection, None] = {}  # the connections that are no clients, the oldest first
         self._stopping = threading.Event()  # whether new requests are refused
-        self._closing = threading.Event()  # whether all requests are answered
         self._key_reader = ThreadPoolExecutor(1, "gr00t-keys")
-        self._listener: socket.socket | None = None
-        self._thread: threading.Thread | None = None
+        self._acceptor: Acceptor | None = None
 
     @property
     def is_stopping(self) -> bool:
@@ -376,14 +369,10 @@ class GR00TDialect(PortDialect):
 
     def serve(self, listener: socket.socket) -> None:
         require("msgpack")
-        listener.listen()
-        listener.settimeout(_TICK_S)
-        self._listener = listener
-        self._thread = threading.Thread(target=self._run, args=(listener,), name="gr00t", daemon=True)
-        self._thread.start()
+        self._acceptor = Acceptor("gr00t", listener, self._add, self._clients.forget_quiet)
 
     def alive(self) -> bool:
-        return self._thread is not None and self._thread.is_alive()
+        return self._acceptor is not None and self._acceptor.alive()
 
     def close(self) -> None:
         self._stopping.set()  # a client of this protocol waits for ever for an answer that does not come
@@ -395,11 +384,8 @@ class GR00TDialect(PortDialect):
         for connection in connections:
             with contextlib.suppress(OSError):  # the client has disconnected
                 connection.refuse_waiting(_stopping())
-        self._closing.set()
-        if self._listener is not None:
-            shut_down(self._listener)
-        if self._thread is not None:
-            self._thread.join(_END_S)
+        if self._acceptor is not None:
+            self._acceptor.close()
         with self._lock:
             connections = list(self._connections)
         for connection in connections:
@@ -432,29 +418,6 @@ class GR00TDialect(PortDialect):
         with self._lock:
             self._strangers.pop(connection, None)
             self._connections.discard(connection)
-
-    def _run(self, listener: socket.socket) -> None:
-        accepting = TokenBucket(_ACCEPTED_PER_S, time.monotonic())
-        checked_at = float("-inf")
-        while not self._closing.is_set():
-            now = time.monotonic()
-            if now - checked_at >= _TICK_S:
-                checked_at = now
-                self._clients.forget_quiet()
-            if (wait_s := accepting.take(now)) > 0:
-                time.sleep(wait_s)
-                continue
-            try:
-                connection, _ = listener.accept()
-            except TimeoutError:
-                continue
-            except OSError as error:
-                if not self._closing.is_set():
-                    logger.warning("gr00t: cannot accept a client: %s", error)
-                    time.sleep(0.1)  # other connections must end first if descriptors are exhausted
-                continue
-            self._add(connection)
-        listener.close()
 
     def _add(self, connection: socket.socket) -> None:
         client = GR00TConnection(self, connection)

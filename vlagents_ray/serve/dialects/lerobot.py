@@ -17,7 +17,6 @@ import numpy as np
 from pydantic import Field
 
 from vlagents_ray.errors import (
-    Forbidden,
     InvalidInput,
     MalformedMessage,
     MessageTooLarge,
@@ -29,8 +28,10 @@ from vlagents_ray.interface import Obs
 from vlagents_ray.registry import require
 from vlagents_ray.serve.access.api_keys import NoKey
 from vlagents_ray.serve.config.dialects import KeylessPortConfig, MappingSetting
+from vlagents_ray.serve.dialects.acceptor import Acceptor
 from vlagents_ray.serve.dialects.base import GatewayContext, PortDialect
 from vlagents_ray.serve.dialects.gateway_sessions import GatewayClient, GatewayClients, internal_error
+from vlagents_ray.serve.dialects.http2_front import Http2Front
 from vlagents_ray.serve.engine.admission import MessageAdmission
 from vlagents_ray.wire import lerobot
 from vlagents_ray.wire.lerobot import PRESETS, PolicyInstructions, RobotObservation, TransferState
@@ -41,7 +42,6 @@ logger = logging.getLogger(__name__)
 _WAIT_S = 2.0  # time that a request for actions waits for an observation, as at LeRobot's own server
 _HZ = 30.0  # rate of the actions' timestamps if the policy's contract has none, as at LeRobot's own server
 _UPLOAD_S = 30.0  # maximum time from an observation's first part to its last
-_TICK_S = 0.5
 _END_S = 3.0
 _REQUESTS = 4  # maximum number of concurrent requests of one client; LeRobot's has two
 _HEARTBEAT_MS = 10_000
@@ -185,7 +185,7 @@ class LeRobotDialectConfig(KeylessPortConfig):
 
 
 class LeRobotDialect(PortDialect):
-    """LeRobot's gRPC service; gRPC's threads process the requests, another thread removes clients that are gone."""
+    """LeRobot's gRPC service; gRPC's threads process the requests, which arrive through an `Http2Front`."""
 
     Config = LeRobotDialectConfig
     clients = "LeRobot"
@@ -203,14 +203,12 @@ class LeRobotDialect(PortDialect):
         self._clients: GatewayClients[str, LeRobotConnection] = GatewayClients(context)
         self._uploads: dict[Any, float] = {}  # gRPC's context of each observation that is being received -> its start
         self._server: Any = None
-        self._ipv4 = True
+        self._front: Http2Front | None = None
+        self._acceptor: Acceptor | None = None
         self._closing = threading.Event()
-        self._thread = threading.Thread(target=self._watch, name="lerobot", daemon=True)
 
     def serve(self, listener: socket.socket) -> None:
         grpc = require("grpc")
-        self._ipv4 = listener.family == socket.AF_INET
-        host, port = listener.getsockname()[:2]
         most = _REQUESTS * self.context.sessions
         unary, stream = grpc.unary_unary_rpc_method_handler, grpc.stream_unary_rpc_method_handler
         methods = {  # over plain bytes
@@ -223,7 +221,6 @@ class LeRobotDialect(PortDialect):
             ThreadPoolExecutor(most, "lerobot-client"),
             handlers=[grpc.method_handlers_generic_handler(lerobot.SERVICE, methods)],
             options=[
-                ("grpc.so_reuseport", 0),  # otherwise another process could share the port
                 ("grpc.max_concurrent_streams", _REQUESTS),
                 ("grpc.max_connection_idle_ms", int(1e3 * self.context.idle_s)),
                 ("grpc.server_handshake_timeout_ms", _HEARTBEAT_MS),
@@ -234,25 +231,25 @@ class LeRobotDialect(PortDialect):
             ],
             maximum_concurrent_rpcs=most,
         )
-        try:
-            self._server.add_insecure_port(f"[{host}]:{port}" if ":" in host else f"{host}:{port}")
-        finally:
-            listener.close()  # gRPC listens at the port by now
+        self._front = Http2Front(self.name, lambda peer: self._clients.get(peer) is not None)
+        self._server.add_insecure_port(self._front.address)
         self._server.start()
-        self._thread.start()
+        self._acceptor = Acceptor(self.name, listener, self._front.add, self._check_clients)
 
     def alive(self) -> bool:
-        return self._thread.is_alive()
+        return self._acceptor is not None and self._acceptor.alive()
 
     def close(self) -> None:
         """Refuse further requests, answer those that have arrived, and end all sessions."""
         self._closing.set()
+        if self._acceptor is not None:
+            self._acceptor.close()
         stopped = None if self._server is None else self._server.stop(_END_S)  # then it ends the remaining requests
         self._clients.end_all()
         if stopped is not None:
             stopped.wait()
-        if self._thread.is_alive():
-            self._thread.join(_END_S)
+        if self._front is not None:
+            self._front.close()
 
     def _answer(self, grpc: Any, method: Callable[[Any, Any], bytes | None], request: Any, context: Any) -> bytes:
         """Return the reply to a request, or end the request with gRPC's status for the error."""
@@ -270,8 +267,6 @@ class LeRobotDialect(PortDialect):
     def _ready(self, _: bytes, context: Any) -> None:
         if self._closing.is_set():
             raise _stopping()
-        if self._ipv4 and context.peer().startswith("ipv6:"):  # gRPC also listens there if the host is 0.0.0.0
-            raise Forbidden("this server is for IPv4; connect to such an address, or set dialects.lerobot.host to '::'")
         make = partial(LeRobotConnection, self.context, self.mapping, self.config.checkpoint)
         self._clients.add(context.peer(), make)
 
@@ -285,7 +280,12 @@ class LeRobotDialect(PortDialect):
         with self._request(context) as client:
             robot = self.config.rank == "robot"
             admission = MessageAdmission(
-                self.context.admission, self.context.limits, None, robot=robot, inline=False, key=_share_of(context)
+                self.context.admission,
+                self.context.limits,
+                None,
+                robot=robot,
+                inline=False,
+                key=self._share_of(context),
             )
             self._uploads[context] = time.monotonic()
             try:
@@ -301,30 +301,27 @@ class LeRobotDialect(PortDialect):
             raise _stopping()
         return None if actions is None else lerobot.write_data(actions)
 
+    def _share_of(self, context: Any) -> str:
+        """Return the name under which a client without a key has a share of the bytes in flight."""
+        return "address unknown" if self._front is None else self._front.share_of(context.peer())
+
     def _request(self, context: Any) -> AbstractContextManager[LeRobotConnection]:
         """Return the context of a request, with its client, identified by its connection."""
         if (client := self._clients.get(context.peer())) is None:
             raise NotReset("Ready: got none over this connection, or it was idle for too long; start the client again")
         return client.request()
 
-    def _watch(self) -> None:
-        """Remove clients that are gone, and end observations that take too long, until the dialect is closed."""
-        while not self._closing.wait(_TICK_S):
-            self._clients.forget_quiet()
-            late = time.monotonic() - _UPLOAD_S
-            for context, begun in list(self._uploads.items()):
-                if begun < late:
-                    context.cancel()
+    def _check_clients(self) -> None:
+        """Remove clients that are gone, and end observations that take too long."""
+        self._clients.forget_quiet()
+        late = time.monotonic() - _UPLOAD_S
+        for context, begun in list(self._uploads.items()):
+            if begun < late:
+                context.cancel()
 
 
 def _stopping() -> PolicyUnavailable:
     return PolicyUnavailable("the server is stopping; connect again")
-
-
-def _share_of(context: Any) -> str:
-    """Return the name under which a client without a key has a share of the bytes in flight: that of its address."""
-    peer: str = context.peer()  # with the port
-    return f"address {peer.rpartition(':')[0]}"
 
 
 def _joined(messages: Iterator[bytes], admission: MessageAdmission) -> bytes:

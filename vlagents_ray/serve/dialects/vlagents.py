@@ -28,6 +28,7 @@ from vlagents_ray.errors import (
 from vlagents_ray.interface import Obs
 from vlagents_ray.serve.access.api_keys import NoKey
 from vlagents_ray.serve.config.dialects import DialectConfig, KeylessPortConfig
+from vlagents_ray.serve.dialects.acceptor import Acceptor
 from vlagents_ray.serve.dialects.base import GatewayContext, PortDialect
 from vlagents_ray.serve.dialects.client_reader import ClientReader, share_of, shut_down
 from vlagents_ray.serve.dialects.gateway_sessions import GatewaySessions, internal_error
@@ -387,8 +388,7 @@ class VlagentsDialect(PortDialect):
         self._clients: dict[threading.Thread, VlagentsConnection] = {}
         self._lock = threading.Lock()
         self._closing = threading.Event()
-        self._listener: socket.socket | None = None
-        self._accepting: threading.Thread | None = None
+        self._acceptor: Acceptor | None = None
 
     @classmethod
     def lacks(cls, config: DialectConfig, contract: Contract | None) -> list[str]:  # noqa: ARG003 - overrides
@@ -396,13 +396,10 @@ class VlagentsDialect(PortDialect):
         return []
 
     def serve(self, listener: socket.socket) -> None:
-        listener.listen()
-        self._listener = listener
-        self._accepting = threading.Thread(target=self._accept, args=(listener,), name="vlagents", daemon=True)
-        self._accepting.start()
+        self._acceptor = Acceptor("vlagents", listener, self._add)
 
     def alive(self) -> bool:
-        return self._accepting is not None and self._accepting.is_alive()
+        return self._acceptor is not None and self._acceptor.alive()
 
     @property
     def closing(self) -> bool:
@@ -412,43 +409,30 @@ class VlagentsDialect(PortDialect):
     def close(self) -> None:
         """Accept no clients, answer the requests that have arrived, and end all sessions."""
         self._closing.set()
-        if self._listener is not None:
-            shut_down(self._listener)
+        if self._acceptor is not None:
+            self._acceptor.close()
         with self._lock:
             clients = dict(self._clients)
         for client in clients.values():
             client.stop_reading()
         deadline = time.monotonic() + _END_S
-        if self._accepting is not None:
-            self._accepting.join(_END_S)
-        if self._listener is not None:
-            self._listener.close()
         for thread, client in clients.items():
             thread.join(max(0.0, deadline - time.monotonic()))
             if thread.is_alive():
                 client.end()
 
-    def _accept(self, listener: socket.socket) -> None:
-        while not self._closing.is_set():
-            try:
-                connection, peer = listener.accept()
-            except OSError as error:
-                if self._closing.is_set():
-                    break
-                logger.warning("vlagents: cannot accept a client: %s", error)
-                time.sleep(0.1)  # other connections must end first if descriptors are exhausted
-                continue
-            client = VlagentsConnection(self, connection)
-            thread = threading.Thread(target=self._serve, args=(client,), name=f"vlagents {peer[0]}", daemon=True)
-            with self._lock:
-                full = len(self._clients) >= self.context.sessions
-                if not full:
-                    self._clients[thread] = client
-            if full:
-                logger.warning("vlagents: %d clients are connected, the limit; one was refused", self.context.sessions)
-                connection.close()
-            else:
-                thread.start()
+    def _add(self, connection: socket.socket) -> None:
+        client = VlagentsConnection(self, connection)
+        thread = threading.Thread(target=self._serve, args=(client,), name="vlagents-client", daemon=True)
+        with self._lock:
+            is_full = len(self._clients) >= self.context.sessions
+            if not is_full:
+                self._clients[thread] = client
+        if is_full:
+            logger.warning("vlagents: %d clients are connected, the limit; one was refused", self.context.sessions)
+            connection.close()
+        else:
+            thread.start()
 
     def _serve(self, client: VlagentsConnection) -> None:
         try:
