@@ -30,6 +30,8 @@ SECONDS = 3.0
 # Of each row of the table. p99 needs a quiet machine and 10 s or more; the rows are printed by `pytest -s`.
 ROW_SECONDS = float(os.environ.get("VLAGENTS_FLOOD_SECONDS", "1.5"))
 MEMORY_MB = 150  # what eight connections of one key may take: for each, a part of a message and what uvicorn copies
+# Of one address's observations without an end: its share of what is in flight, 128 MB, and gRPC's buffers and heaps.
+UPLOADS_MEMORY_MB = 256
 ATTEMPTS = 3  # a machine that does something else meanwhile misleads
 NOISE_MS = 5.0  # of p90 on a machine with two cores, of which the flooding process takes one while it begins
 CASES = [
@@ -197,7 +199,7 @@ def test_no_behaviour_of_a_connection_delays_a_robot_or_leaves_anything(
     record_property("row", row)
     print(f"ROW {way} | {behaviour} | {row}")
     assert is_calm, row
-    assert held < MEMORY_MB, row
+    assert held < (UPLOADS_MEMORY_MB if behaviour == flood.UPLOADS else MEMORY_MB), row
 
 
 @pytest.mark.parametrize("way", flood.WEBSOCKETS)
