@@ -152,7 +152,6 @@ class KeyedReplica:
         patch.setattr(api_keys, "_CHECK_S", 0.0)
         patch.setattr(access_middleware, "_TICK_S", 0.02)
         patch.setattr(periodic.each_half_second, "_period_s", 0.02)
-        patch.setattr("vlagents_ray.serve.dialects.gr00t._TICK_S", 0.02)
         self.known = ChangingKeys()
         self.at_gateway = self.known.another()  # of another process
         self.policy = Recorder()
