@@ -10,6 +10,7 @@ import socket
 import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
+from http.client import HTTPConnection
 from pathlib import Path
 
 import flood
@@ -104,6 +105,8 @@ OF_HAPROXY = ("nothing", "half a handshake", "closed at once")
 TABLE = [
     *(("own port", behaviour) for behaviour in flood.BEHAVIOURS),
     *(("WS /v1/stream", behaviour) for behaviour in flood.BEHAVIOURS if behaviour not in OF_HAPROXY),
+    *(("shared memory", behaviour) for behaviour in flood.NEAR),
+    *((page, behaviour) for page in flood.PAGES for behaviour in (*flood.BEHAVIOURS, *flood.OF_VIEWERS)),
     *(
         (way, behaviour)
         for way in flood.WEBSOCKETS
@@ -119,11 +122,17 @@ def gateways() -> Iterator[flood.Where]:
         yield {**json.loads(server.stdout.readline()), "pid": server.pid}
 
 
+@pytest.fixture(scope="module")
+def page() -> Iterator[flood.Where]:
+    with flood.child("page") as server:
+        yield {**json.loads(server.stdout.readline()), "pid": server.pid}
+
+
 Robot = Callable[[], object]  # one call of a robot
 
 
 @pytest.fixture(scope="module")
-def robots(robot: ShmTransport, gateways: flood.Where) -> Iterator[dict[str, Robot]]:
+def robots(robot: ShmTransport, gateways: flood.Where, page: flood.Where) -> Iterator[dict[str, Robot]]:
     """A robot of the replica, and those of the gateways, by the way of the attack beside them."""
 
     def act() -> None:
@@ -131,6 +140,16 @@ def robots(robot: ShmTransport, gateways: flood.Where) -> Iterator[dict[str, Rob
         assert reply.error is None
 
     ports = gateways["gateways"]
+
+    def show() -> None:
+        # From another address than the flood: each may hold 32 connections.
+        connection = HTTPConnection("127.0.0.1", page["port"], timeout=60, source_address=("127.0.0.2", 0))
+        with contextlib.closing(connection):
+            connection.request("GET", "/live", headers={"authorization": "Bearer robot"})
+            answer = connection.getresponse()
+            assert answer.status == 200
+            assert answer.read()
+
     with (
         PolicyClient(ports["gr00t"], "robot") as of_gr00t,
         socket.create_connection(("127.0.0.1", ports["vlagents"]), timeout=60) as of_vlagents,
@@ -144,6 +163,7 @@ def robots(robot: ShmTransport, gateways: flood.Where) -> Iterator[dict[str, Rob
 
         yield {
             **dict.fromkeys(flood.WAYS, act),
+            **dict.fromkeys(flood.PAGES, show),
             "gr00t": of_gr00t.ping,
             "vlagents": name,
             "lerobot": lambda: ready(b"", timeout=60),
@@ -163,6 +183,7 @@ GATEWAY_TABLE = [(way, name) for way, behaviours in flood.GATEWAYS.items() for n
 def test_no_behaviour_of_a_connection_delays_a_robot_or_leaves_anything(
     where: flood.Where,
     gateways: flood.Where,
+    page: flood.Where,
     robots: dict[str, Robot],
     alone_ms: dict[str, list[float]],
     way: str,
@@ -170,10 +191,14 @@ def test_no_behaviour_of_a_connection_delays_a_robot_or_leaves_anything(
     record_property: Callable[[str, object], None],
 ) -> None:
     """One key of rate 1, or no key, with eight connections."""
-    where, call = (gateways if way in flood.GATEWAYS else where), robots[way]
+    call = robots[way]
+    if way in flood.GATEWAYS:
+        where = gateways
+    elif way in flood.PAGES:
+        where = page
     call()
     memory, sockets = resources(where["pid"])
-    name = way if way in flood.GATEWAYS else "replica"
+    name = "replica" if way in flood.WAYS else way
     for attempt in range(ATTEMPTS):
         if attempt or name not in alone_ms:
             await_calm(where["pid"])  # an attempt before this one may have left much to do

@@ -1,6 +1,6 @@
 """A keyed replica in a process of its own, and one that floods it.
 
-`flood.py serve`, `flood.py gateways`, and `flood.py attack WAY PART WHERE CONNECTIONS S`.
+`flood.py serve`, `flood.py gateways`, `flood.py page`, and `flood.py attack WAY PART WHERE CONNECTIONS S`.
 """
 
 from __future__ import annotations
@@ -23,6 +23,7 @@ from dataclasses import asdict, dataclass
 from functools import cache, partial
 from pathlib import Path
 from typing import Any
+from urllib.parse import urlsplit
 
 import grpc
 import hostile_images
@@ -58,6 +59,8 @@ from vlagents_ray.serve.endpoints.shm import ShmServer
 from vlagents_ray.serve.endpoints.websocket import WebSocketServer
 from vlagents_ray.serve.engine.admission import Admission
 from vlagents_ray.serve.engine.engine import Engine
+from vlagents_ray.serve.observers.live_page import page_server
+from vlagents_ray.serve.observers.live_view import Fleet
 from vlagents_ray.serve.ports import reserve
 from vlagents_ray.wire import gr00t as gr00t_wire
 from vlagents_ray.wire import json_numpy, lerobot, rpyc, zmtp
@@ -82,7 +85,7 @@ def _key(name: str, **limits: Any) -> dict[str, Any]:
 
 def key_of(way: str) -> str:
     """The key of whoever floods that way, which is its name, too."""
-    return f"way-{[*WAYS, *GATEWAYS].index(way)}"
+    return f"way-{[*WAYS, *GATEWAYS, *PAGES].index(way)}"
 
 
 def serve() -> None:
@@ -131,6 +134,16 @@ def serve_gateways() -> None:
     sys.stdin.read()
     for dialect in dialects:
         dialect.close()
+
+
+def serve_page() -> None:
+    """Serve the live page of an evaluation; print its port as JSON."""
+    rated = [_key(key_of(way), rate=1, scopes=["watch"]) for way in PAGES]
+    keys = Keys.from_text(json.dumps({"keys": [_key("robot", scopes=["watch"]), *rated]}))
+    fleet = Fleet(None, more=dict)
+    with page_server(fleet, ("127.0.0.1", 0), keys, name="app", videos=lambda _: None) as url:
+        print(json.dumps({"port": urlsplit(url).port, "own": [0, ""]}), flush=True)
+        sys.stdin.read()
 
 
 def _jpeg() -> bytes:
@@ -382,6 +395,11 @@ WEBSOCKETS = {way: way.removeprefix("WS ") for way in WAYS if way.startswith("WS
 WEBSOCKETS["own port"] = "own"
 
 
+PAGES = {"page of an evaluation": "/v1/live"}
+# What only a viewer of a page sends.
+OF_VIEWERS: dict[str, Callable[[], bytes]] = {"requests of viewers": lambda: _masked(0x81, b'{"shown": []}')}
+
+
 def misbehave(path: str, behaviour: str, where: Where, key: str, end: float) -> None:
     """Behave in that way over one connection, until the server ends it, or until the `end`."""
     if behaviour in BEFORE_A_KEY:
@@ -406,7 +424,7 @@ def misbehave(path: str, behaviour: str, where: Where, key: str, end: float) -> 
             connection.sendall(ONCE[behaviour])
             _drain(connection)
         else:
-            frame = REPEATED[behaviour]()
+            frame = (REPEATED | OF_VIEWERS)[behaviour]()
             payload = frame * max(1, 2**18 // len(frame))
             threading.Thread(target=_drain, args=(connection,), daemon=True).start()
             while time.monotonic() < end:
@@ -577,11 +595,49 @@ def misbehave_at_gateway(way: str, name: str, where: Where, end: float) -> None:
             _drain(connection)
 
 
+_MEMORY = LocalAddress.REQUEST
+# What a process of this user sends to the socket of the shared memory: before a key, or after it, and whether again.
+NEAR: dict[str, tuple[bool, bytes, bool]] = {
+    "nothing": (False, b"", False),
+    "closed at once": (False, b"", False),
+    "wrong keys": (False, b"wrong", True),
+    "a long key": (False, bytes(200_000), True),
+    "nothing after its key": (True, b"", False),
+    "half a head": (True, bytes(_MEMORY.size - 1), True),
+    "a file that is not there": (True, _MEMORY.pack(0, 0, 2**20), True),
+    "a file that is shorter": (True, _MEMORY.pack(0, 0, 2**20), True),
+    "a number without a file": (True, _MEMORY.pack(LocalAddress.FILES + 1, 0, 100), True),
+    "many connections": (True, b"", False),
+}
+_MANY = 60  # connections of each thread
+
+
+def misbehave_near(behaviour: str, where: Where, key: str, end: float) -> None:
+    """Behave in that way at the shared memory's socket, until the server ends the connection, or until the `end`."""
+    shows_key, message, repeats = NEAR[behaviour]
+    with contextlib.ExitStack() as stack:
+        for _ in range(_MANY if behaviour == "many connections" else 1):
+            connection = stack.enter_context(socket.socket(*UNIX))
+            connection.connect("\0" + where["local"]["socket"])
+            if shows_key:
+                connection.send(key.encode())
+        if behaviour == "closed at once":
+            return
+        threading.Thread(target=_drain, args=(connection,), daemon=True).start()
+        if behaviour == "a file that is shorter":
+            socket.send_fds(connection, [message], [_memory_file(bytes(100))])
+        while repeats and time.monotonic() < end:
+            connection.send(message)
+        connection.settimeout(max(0.01, end - time.monotonic()))
+        connection.recv(1)
+
+
 def attack(way: str, part: str, where: Where, connections: int, seconds: float) -> None:
     """Send the largest messages, or misbehave, for so long, as fast as bytes are taken, whatever is answered."""
     make, send = WAYS.get(way, (bytes, _shared_memory))
     end = time.monotonic() + seconds
-    message = b"" if part in BEHAVIOURS or way in GATEWAYS else PARTS.get(part, make)()
+    is_behaviour = part in BEHAVIOURS or part in OF_VIEWERS or part in NEAR or way in GATEWAYS
+    message = b"" if is_behaviour else PARTS.get(part, make)()
     if part in REPEATED:
         REPEATED[part]()  # before it is measured, since the bomb takes time to make
 
@@ -590,8 +646,10 @@ def attack(way: str, part: str, where: Where, connections: int, seconds: float) 
             with contextlib.suppress(OSError):  # cut off: once more
                 if way in GATEWAYS:
                     misbehave_at_gateway(way, part, where, end)
-                elif part in BEHAVIOURS:
-                    misbehave(WEBSOCKETS[way], part, where, key_of(way), end)
+                elif way == "shared memory" and part in NEAR:
+                    misbehave_near(part, where, key_of(way), end)
+                elif part in BEHAVIOURS or part in OF_VIEWERS:
+                    misbehave((WEBSOCKETS | PAGES)[way], part, where, key_of(way), end)
                 else:
                     send(message, where, key_of(way), end)
             time.sleep(0.001)
@@ -674,5 +732,7 @@ if __name__ == "__main__":
         serve()
     elif sys.argv[1] == "gateways":
         serve_gateways()
+    elif sys.argv[1] == "page":
+        serve_page()
     else:
         attack(sys.argv[2], sys.argv[3], json.loads(sys.argv[4]), int(sys.argv[5]), float(sys.argv[6]))

@@ -31,7 +31,7 @@ from vlagents_ray.evaluate.artifacts.storage import whole
 from vlagents_ray.images.jpeg_png import decode, encode_jpeg
 from vlagents_ray.interface import Obs
 from vlagents_ray.naming import distinct
-from vlagents_ray.page_protocol import PageProtocol
+from vlagents_ray.page_protocol import BACKLOG, PageProtocol
 
 Outcome = Literal["success", "failure", "partial", "repeat"]
 SCENES = "scenes"
@@ -282,7 +282,15 @@ class PageOperator(Operator):
             Route("/now/answer", self._take, methods=["POST"]),
         ]
         app = Starlette(routes=[Mount(f"/{token}", routes=routes)])
-        settings = uvicorn.Config(app, log_config=None, access_log=False, lifespan="off", http=PageProtocol, ws="none")
+        settings = uvicorn.Config(
+            app,
+            log_config=None,
+            access_log=False,
+            lifespan="off",
+            http=PageProtocol,
+            ws="none",
+            backlog=BACKLOG,
+        )
         self._server = uvicorn.Server(settings)
         self._thread = threading.Thread(
             target=lambda: asyncio.run(self._server.serve([listening])), name="vlagents-ray-operator", daemon=True

@@ -42,7 +42,7 @@ from starlette.routing import BaseRoute, Route, WebSocketRoute
 from starlette.websockets import WebSocket, WebSocketDisconnect
 
 from vlagents_ray.errors import ConfigError, MalformedMessage, MessageTooLarge, Overloaded, VLAgentsError
-from vlagents_ray.page_protocol import PageProtocol
+from vlagents_ray.page_protocol import BACKLOG, PageProtocol
 from vlagents_ray.protocol.json_messages import problem
 from vlagents_ray.protocol.messages import is_loopback
 from vlagents_ray.serve.access.api_keys import Caller, Keys, ScopeCheck, caller_name, current_caller
@@ -256,6 +256,7 @@ def page_server(
         http=PageProtocol,
         ws="websockets-sansio",
         ws_per_message_deflate=False,
+        backlog=BACKLOG,
         timeout_graceful_shutdown=_END_S,
     )
     server = uvicorn.Server(config)
