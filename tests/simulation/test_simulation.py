@@ -91,16 +91,18 @@ def overwrite(replica: Replica) -> None:
         table._sessions[arriving.id] = arriving
 
     table.enter = enter  # type: ignore[method-assign]
-    replica.migrator.announce = lambda *_: None  # type: ignore[method-assign]
+    replica.migrator.announce = lambda _session, _step, then: then()  # type: ignore[method-assign]
 
 
 def export_at_once(replica: Replica) -> None:
     """To copy a session is to give it up, whether or not the one who asked still waits."""
     held = replica.migrator.held
 
-    async def copy(session_id: str) -> dict[str, Any] | None:
+    async def copy(session_id: str, offered: bool = False) -> dict[str, Any] | None:
+        asked = replica.engine.clock()
         state = await held._ask(session_id, "export", None)
         if state is not None:
+            state["age_s"] = asked - state.pop("began")
             replica.engine.sessions.close(session_id)
             replica.engine.sessions._left.clear()
         return state

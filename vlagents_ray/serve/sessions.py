@@ -88,8 +88,11 @@ class SessionFinder(Protocol):
     ) -> bool:
         """Fetch a session that has a `user`, then call `then`, found or not; return False if `caller` has too many."""
 
-    def announce(self, session_id: str, step: int) -> None:
-        """Announce to the other replicas that the session began an episode here at `step`; their states are older."""
+    def announce(self, session_id: str, step: int, then: Callable[[], None]) -> None:
+        """Announce to the other replicas that the session began an episode here at `step`; their states are older.
+
+        `then` is called once the others have dropped those states, or a short time has passed.
+        """
 
 
 class SessionTable(Generic[M]):

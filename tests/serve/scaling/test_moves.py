@@ -89,7 +89,6 @@ class Moves(RuleBasedStateMachine):
         reply = ask(self.served, at, "reset", self.names[name], kwargs=kwargs, step=known and known.step)
         assert reply.error is None
         self.open[name] = _Session(0, self.newest if follows else self.pinned, follows, reply.step)
-        self.served.engines[1 - at].sessions.drop_older({self.names[name]: reply.step or 0})  # at the latest now
 
     @rule(name=st.sampled_from(_NAMES), at=st.sampled_from([0, 1]), steps=st.booleans())
     def act(self, name: str, at: int, steps: bool) -> None:

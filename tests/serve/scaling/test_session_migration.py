@@ -210,6 +210,37 @@ def test_where_a_session_is_reset_the_others_forget_it(replicas: Callable[[int],
     assert obeys(served.engines[0]) == ("the next one", 1)
 
 
+def test_an_act_after_a_reset_is_of_the_new_episode_at_every_replica(replicas: Callable[[int], Replicas]) -> None:
+    """Also at a replica that still has the old episode, for a client that sends no step and acts at once."""
+    served = replicas(3)
+    for number in range(12):
+        ask(served.engines[number % 3], "reset", instruction=f"episode {number}")
+        acting = [served.engines[(number + further) % 3] for further in (2, 1, 0)]  # the first has the old episode
+        assert [obeys(engine) for engine in acting] == [(f"episode {number}", acts) for acts in (1, 2, 3)]
+
+
+def test_a_replica_that_does_not_answer_delays_a_reset_only_a_little(replicas: Callable[[int], Replicas]) -> None:
+    served = replicas(2)
+    served.frozen.add(1)
+    assert ask(served.engines[0], "reset", instruction="episode 1").error is None
+
+
+@pytest.mark.parametrize("gather_s", [0.0, 60.0])
+def test_a_reset_is_answered_if_its_replica_stops_meanwhile(
+    replicas: Callable[[int], Replicas], gather_s: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Before and after it has asked the other replicas, one of which does not answer."""
+    monkeypatch.setattr(session_migration, "_GATHER_S", gather_s)
+    monkeypatch.setattr(session_migration, "_OTHERS_S", 60.0)
+    served = replicas(2)
+    served.frozen.add(1)
+    answers = begin(served.engines[0], "reset", instruction="episode 1")
+    migrator = served.migrators[0]
+    wait_for(lambda: migrator._tasks and bool(migrator._announced) == bool(gather_s), every_s=0.001)
+    asyncio.run_coroutine_threadsafe(served.migrators[0].close(), served._loop).result(20)
+    assert answers.get(timeout=20).error is None
+
+
 def test_clocks_that_differ_do_not_make_an_episode_old_that_its_client_knows_to_be_new(
     replicas: Callable[[int], Replicas],
 ) -> None:

@@ -524,10 +524,16 @@ class Engine:
         session.agent, session.instruction = agent, request.instruction or ""
         model.padding.record_reset(request, opening.kwargs)
         request.drop_observations()
-        if not session.announced and self.finder is not None:
-            session.announced = True
-            self.finder.announce(session.id, session.steps)
-        pending.finish(Reply(request.request_id, info=info, step=session.steps, timing=spent))
+        reply = Reply(request.request_id, info=info, step=session.steps, timing=spent)
+        if session.announced or self.finder is None:
+            pending.finish(reply)
+            return
+        session.announced = True
+        if pending.origin.owner:  # the session's acts come over the same connection, to this replica
+            pending.finish(reply)
+            self.finder.announce(session.id, session.steps, lambda: None)
+        else:  # the next act may come to a replica that still has an older episode
+            self.finder.announce(session.id, session.steps, partial(pending.finish, reply))
 
     def _requeue(self, pending: PendingRequest, error: VLAgentsError | None) -> None:
         """Queue a reset again whose checkpoint is loaded, or answer it with the error."""

@@ -253,6 +253,7 @@ class SessionMigrator:
         self._next_query: dict[str, asyncio.Future[_Answers]] = {}  # sessions of the next query
         self._callers: Counter[str] = Counter()  # number of running searches by caller
         self._unannounced: dict[str, int] = {}  # steps of begun episodes that are not announced yet, by session
+        self._announced: list[Callable[[], None]] = []  # called once those are announced
         self._offered = 0  # number of sessions that are being fetched since other replicas offered them
         self._silent: dict[str, float] = {}  # time until which a silent replica gets no request, by its name
         self._tasks: set[asyncio.Task[Any]] = set()
@@ -296,11 +297,15 @@ class SessionMigrator:
         self._loop.call_soon_threadsafe(lambda: self._spawn(self._search(session_id)))
         return True
 
-    def announce(self, session_id: str, step: int) -> None:
-        """Announce to the other replicas that the session began an episode here at `step`; their states are older."""
+    def announce(self, session_id: str, step: int, then: Callable[[], None]) -> None:
+        """Announce to the other replicas that the session began an episode here at `step`; their states are older.
+
+        `then` is called once they have dropped those states, or `_OTHERS_S` have passed.
+        """
         with self._lock:
+            self._announced.append(then)
             self._unannounced[session_id] = step
-            if len(self._unannounced) > 1:
+            if len(self._announced) > 1:
                 return
         self._loop.call_soon_threadsafe(lambda: self._spawn(self._announce_all()))
 
@@ -497,12 +502,23 @@ class SessionMigrator:
             return None
 
     async def _announce_all(self) -> None:
-        await asyncio.sleep(_GATHER_S)
-        with self._lock:
-            begun, self._unannounced = self._unannounced, {}
-        if not self._closed:
-            for peer in await self._peers():
-                self._spawn(self._answer(peer.ask(HeldSessions.drop_older, begun)))
+        try:
+            await asyncio.sleep(_GATHER_S)
+        finally:  # also if the task is cancelled, as the replica stops
+            with self._lock:
+                begun, self._unannounced = self._unannounced, {}
+                announced, self._announced = self._announced, []
+            self._spawn(self._announce(begun, announced))
+
+    async def _announce(self, begun: dict[str, int], announced: list[Callable[[], None]]) -> None:
+        try:
+            peers = [] if self._closed else await self._peers()
+            if peers:
+                answers = [self._spawn(self._answer(peer.ask(HeldSessions.drop_older, begun))) for peer in peers]
+                await asyncio.wait(answers, timeout=_OTHERS_S)
+        finally:
+            for then in announced:
+                then()
 
     def _finish(self, session_id: str) -> None:
         with self._lock:
