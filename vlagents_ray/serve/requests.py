@@ -83,6 +83,7 @@ class Origin:
     # The owner's sessions, by their ids in the engine: the step at which the episode began that the owner last reset or
     # acted in; None if it has done neither.
     sessions: dict[str, int | None] = field(default_factory=dict)
+    opened: float = 0.0  # time at which the connection was opened, s, of the engine's clock
     ended: bool = False  # whether the connection has ended, so that its waiting requests do nothing more
 
 
@@ -154,6 +155,15 @@ class PendingRequest:
     def fail(self, error: VLAgentsError) -> None:
         """Deliver an error, unless the request is over."""
         self.finish(Reply(self.request.request_id, error=error))
+
+    @property
+    def latest_begin(self) -> float:
+        """Latest time at which the episode of an act can have begun that its connection has not been in before, s.
+
+        A client that continues an episode has begun it before it opened the connection. A later episode may have begun
+        after the client sent the act, since requests of several connections arrive in any order.
+        """
+        return self.origin.opened if self.origin.owner else self.arrived
 
     def expired(self, now: float) -> bool:
         """Return whether the deadline has passed at `now`, s."""

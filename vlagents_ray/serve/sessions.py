@@ -51,7 +51,8 @@ class Session(Generic[M]):
     steps: int = 0  # step of its state: drawn at each reset, above all earlier steps, and incremented by each act
     first: int = 0  # step drawn at the last reset that was run
     expected: int = 0  # step drawn for the latest reset, which may still be queued
-    began: float = 0.0  # time at which that reset arrived, s, of the engine's clock
+    began: float = 0.0  # time at which the last reset arrived that was run, s, of the engine's clock
+    last_reset: float = 0.0  # time at which the latest reset arrived, which may still be queued, s
     moves: int = 0  # number of moves between replicas since the last reset
     announced: bool = False  # whether it was announced to the other replicas, which then keep no older state
     used: float = field(default_factory=time.monotonic)  # time of its last request, s
@@ -173,7 +174,7 @@ class SessionTable(Generic[M]):
             session = self._sessions.get(session_id)
             if session is None or session.expected != first or session.steps == first:
                 return
-            session.expected = session.first
+            session.expected, session.last_reset = session.first, session.began
             if session.steps == 0:  # the reset was the session's first one here
                 del self._sessions[session_id]
                 self.ended(session)

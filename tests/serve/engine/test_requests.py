@@ -6,13 +6,21 @@ import asyncio
 import queue
 import threading
 from collections.abc import Iterator, Sequence
+from typing import Any
 
 import numpy as np
 import pytest
 from eval_fakes import wait_for
 from in_flight import ask, send
 
-from vlagents_ray.errors import DeadlineExceeded, InvalidInput, MessageTooLarge, PolicyFailed, PolicyUnavailable
+from vlagents_ray.errors import (
+    DeadlineExceeded,
+    InvalidInput,
+    MessageTooLarge,
+    PolicyFailed,
+    PolicyUnavailable,
+    UnknownSession,
+)
 from vlagents_ray.interface import Act, Agent, Obs
 from vlagents_ray.protocol import frames
 from vlagents_ray.protocol.frames import Decoded, decode_replies
@@ -55,14 +63,14 @@ class Served:
         return Sender(self.engine, "test", name, caller=NoKey.OPEN, connected=connected)
 
     def put(
-        self, sender: Sender, op: str, info: dict[str, object] | None = None, **fields: float
+        self, sender: Sender, op: str, info: dict[str, object] | None = None, **fields: Any
     ) -> queue.SimpleQueue[list[Reply]]:
         replies: queue.SimpleQueue[list[Reply]] = queue.SimpleQueue()
         send(sender, [Request(op, Obs(info=info or {}), **fields)], replies.put)  # type: ignore[arg-type]
         return replies
 
-    def ask(self, sender: Sender, op: str) -> Reply:
-        [reply] = self.put(sender, op).get(timeout=10)
+    def ask(self, sender: Sender, op: str, **fields: Any) -> Reply:
+        [reply] = self.put(sender, op, **fields).get(timeout=10)
         assert reply.error is None
         return reply
 
@@ -106,6 +114,40 @@ def test_a_close_that_comes_too_late_leaves_the_session_to_the_end_of_its_connec
     assert "other" in served.engine.sessions
     other.release()
     assert "other" not in served.engine.sessions
+
+
+@pytest.mark.parametrize("was_in", ["none", "the episode before"])
+@pytest.mark.parametrize("with_step", [False, True])
+def test_what_comes_late_over_an_old_connection_neither_acts_in_nor_ends_a_newer_episode(
+    served: Served, was_in: str, with_step: bool
+) -> None:
+    """Its client has closed it, and has reset the session over a new one."""
+    old = served.sender("other")
+    before = served.ask(old if was_in == "the episode before" else served.sender("other"), "reset")
+    new = served.sender("other")
+    served.ask(new, "reset", session="other")
+    step = before.step if with_step else None
+    late = served.put(old, "act", session="other", step=step).get(timeout=10)[0]
+    assert isinstance(late.error, UnknownSession)
+    old.release()
+    served.ask(new, "act", session="other")
+
+
+@pytest.mark.parametrize("reset_over_http", [True, False])
+def test_a_connection_acts_without_a_step_in_an_episode_that_had_begun_when_it_was_opened(
+    served: Served, reset_over_http: bool
+) -> None:
+    """As after a hand-over; a later reset that is withdrawn changes nothing."""
+    served.ask(served.sender("other", connected=not reset_over_http), "reset")
+    new = served.sender("new")
+    served.occupy()
+    [withdrawn] = send(served.sender("other", connected=False), [Request("reset", Obs())], lambda _: None)
+    served.engine.withdraw(withdrawn)
+    act = served.put(new, "act", session="other")
+    served.go_on()
+    assert act.get(timeout=10)[0].error is None
+    new.release()
+    assert "other" not in served.engine.sessions, "it ends with the connection that used it last"
 
 
 @pytest.mark.parametrize("error", [RuntimeError("broken"), SystemExit(1)], ids=repr)

@@ -148,13 +148,13 @@ class _HttpEndpoint:
 
     async def stream(self, socket: WebSocket) -> None:
         """Serve one WebSocket, whose sessions end with it; a malformed request gets an error and affects no session."""
+        sender = Sender(self.engine, "websocket", caller=current_caller())
         await socket.accept()
         if len(self.engine.sessions) >= self.engine.sessions.limit:
             full = self.engine.sessions.full()
             await socket.send_bytes(encode_replies([messages.Reply(error=full)]))
             await socket.close(_TRY_AGAIN_LATER, str(full)[:120])
             return
-        sender = Sender(self.engine, "websocket", caller=current_caller())
         try:
             while not sender.refused_too_often:
                 await sender.wait_unthrottled()

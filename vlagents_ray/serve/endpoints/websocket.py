@@ -401,10 +401,10 @@ class WebSocketConnection(PolledConnection):
                 self._protocol.send_response(response)
         if self._protocol.state is not State.OPEN or self.caller is None:
             return False
-        with self._sending:
-            self._flush()
         self._received.attach(self._protocol)
         self._sender = Sender(self._engine, self._name, caller=self.caller)
+        with self._sending:
+            self._flush()
         return True
 
     def _refuse_handshake(self) -> None:

@@ -317,7 +317,8 @@ class Engine:
             if pending.episode is None:
                 known = origin.sessions.get(pending.session_id)
                 pending.episode = self._latest_episode(pending, session) if known is None else known
-            session.origin = origin
+            if (pending.episode if step is None else step) >= session.expected:
+                session.origin = origin  # an act of an older episode, which will be refused, does not use the session
             if (model := session.model) is not None:  # another thread may set it to None
                 model.check(request)
                 pending.model = model
@@ -330,7 +331,7 @@ class Engine:
                 model.check(request)
             session = self.sessions.open(pending.session_id, origin)
             opening.first = self.sessions.begin(session, request.step)
-            session.began = pending.arrived
+            session.last_reset = pending.arrived
             pending.opening = opening
         if origin.owner and request.op != "close":
             self._bind(pending)
@@ -338,10 +339,10 @@ class Engine:
     def _latest_episode(self, pending: PendingRequest, session: Session[LoadedModel]) -> int:
         """Return the step at which the episode began that an act belongs to whose connection has none.
 
-        That is the session's latest one. An act that waited for a search of its session does not belong to an episode
-        that began meanwhile.
+        That is the session's latest one; but an act without a step does not belong to an episode that has begun since
+        the connection was opened, or over HTTP, since the act arrived, while it waited for a search of its session.
         """
-        if pending.sought and session.began >= pending.arrived and pending.request.step is None:
+        if pending.request.step is None and session.last_reset > pending.latest_begin:
             raise session.wrong_episode()
         return session.expected
 
@@ -423,7 +424,7 @@ class Engine:
         elif episode is not None:
             fits = episode == state["first"]
         else:
-            fits = began < pending.arrived
+            fits = began <= pending.latest_begin
         return pending.origin if fits else None
 
     def run(self, taken: Taken) -> None:
@@ -485,6 +486,7 @@ class Engine:
             session.steps, session.resetting = opening.first, pending
             session.first, session.moves = opening.first, 0
             session.expected = max(session.expected, opening.first)
+            session.began, session.last_reset = pending.arrived, max(session.last_reset, pending.arrived)
             is_abandoned = partial(self._is_abandoned, pending, session)
             if self.models.hold(session, opening.choice, partial(self._requeue, pending), is_abandoned) is None:
                 pending.begun = False  # the policy does no work on it while its checkpoint is loaded
@@ -726,6 +728,7 @@ class Engine:
             first=first,
             expected=first,
             began=began,
+            last_reset=began,
             moves=moves,
             announced=True,
             origin=origin,

@@ -74,7 +74,7 @@ class Sender:
         self._prefix = f"{caller.name}/" if isinstance(caller, Caller) else ""  # prefix of the sender's session ids
         self.session_id = self._prefix + self._session_id  # id of the sender's own session in the engine
         owner = uuid.uuid4().hex if connected else ""
-        self._origin = Origin(transport, owner, self.session_id, self._caller, self._prefix)
+        self._origin = Origin(transport, owner, self.session_id, self._caller, self._prefix, opened=engine.clock())
 
     def message(self, op: str = "unknown", rank: str = "robot") -> Message:
         """Return a message that has just arrived from the sender, see `Message`."""
