@@ -22,6 +22,7 @@ from vlagents_ray.protocol.messages import Reply, Request
 from vlagents_ray.serve.access.api_keys import NoKey
 from vlagents_ray.serve.engine.engine import Engine
 from vlagents_ray.serve.engine.sender import Sender
+from vlagents_ray.serve.requests import PendingRequest
 from vlagents_ray.serve.scaling import session_migration
 from vlagents_ray.serve.scaling.session_migration import HeldSessions, Peer
 from vlagents_ray.serve.weights import Rest
@@ -287,6 +288,61 @@ def test_a_session_whose_export_takes_too_long_stays(
     Counting.gate.set()
     assert busy.get(timeout=20).error is None
     assert obeys(a) == ("episode 1", 1)
+
+
+def test_a_release_that_the_policy_has_begun_is_answered_however_long_it_takes(
+    replicas: Callable[[int], Replicas], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Otherwise the session would be at no replica."""
+    served = replicas(2)
+    a, b = served.engines
+    ask(a, "reset", instruction="episode 1")
+    release, cancel, cancelled = a.sessions.release, a.queue.cancel, queue.SimpleQueue[bool]()
+
+    def slow_release(*args: Any) -> bool:
+        Counting.entered.put("")
+        assert Counting.gate.wait(20)
+        return release(*args)
+
+    def record_cancel(pending: PendingRequest) -> bool:
+        was_cancelled = cancel(pending)
+        cancelled.put(was_cancelled)
+        return was_cancelled
+
+    monkeypatch.setattr(a.sessions, "release", slow_release)
+    monkeypatch.setattr(a.queue, "cancel", record_cancel)
+    monkeypatch.setattr(session_migration, "EXPORT_S", 0.5)
+    act = begin(b, "act")
+    Counting.entered.get(timeout=20)
+    assert cancelled.get(timeout=20) is False
+    Counting.gate.set()
+    assert act.get(timeout=20).act.info["obeys"] == "episode 1"
+
+
+def test_an_act_that_joins_a_search_is_not_answered_from_older_answers(replicas: Callable[[int], Replicas]) -> None:
+    """The session has acted at its replica after that sent its state."""
+    served = replicas(2)
+    a, b = served.engines
+    first = ask(a, "reset", instruction="episode 1").step
+    held, copied, go_on = served.migrators[0].held, threading.Event(), threading.Event()
+    copy = held.copy
+
+    async def slow_copy(*args: Any) -> Any:
+        state = await copy(*args)
+        copied.set()
+        assert await asyncio.to_thread(go_on.wait, 20)
+        return state
+
+    held.copy = slow_copy  # type: ignore[method-assign]
+    given_up = begin(b, "act", step=first + 7)  # no state fits it
+    assert copied.wait(20)
+    second = ask(a, "act", step=first).step
+    joined = begin(b, "act", step=second)
+    go_on.set()
+    assert isinstance(given_up.get(timeout=20).error, UnknownSession)
+    reply = joined.get(timeout=20)
+    assert reply.error is None
+    assert int(reply.act.action[0]) == 2
 
 
 def test_a_session_that_goes_on_while_it_is_copied_is_not_released(replicas: Callable[[int], Replicas]) -> None:

@@ -104,6 +104,14 @@ class BatchQueue:
             for pending in requests:
                 pending.over = True
 
+    def cancel(self, pending: PendingRequest) -> bool:
+        """End a request without an answer, unless a batch has taken it; return whether it was ended."""
+        with self._lock:
+            if pending.begun:
+                return False
+            pending.over = True
+            return True
+
     def next(self) -> Taken | None:
         """Wait for requests, and return the next batch; it is empty after `idle_s`, and None after `close`."""
         if not self._wait_for_request():

@@ -52,6 +52,7 @@ InThread = Callable[..., Awaitable[Any]]
 Spawn = Callable[[Coroutine[Any, Any, Any]], "asyncio.Task[Any]"]
 FetchFrom = Callable[[str, str], Awaitable[bool]]  # fetches a session from the replica of that name
 UserOf = Callable[[dict[str, Any], float], Origin | None]
+_Callback = tuple[Callable[[], None], UserOf]  # called when a search is over, and its request's `user` of `fetch`
 _PENDING = 4096  # largest number of concurrent searches of a caller; further requests get `UnknownSession` at once
 _ANSWER_S = 3.0  # time limit for another replica's answer; a replica that still loads does not answer
 _OTHERS_S = 0.3  # time limit for the remaining answers, once a replica has answered that it holds the session
@@ -192,15 +193,14 @@ class HeldSessions:
     async def _ask(self, session_id: str, op: Op, timeout_s: float | None, **kwargs: Any) -> dict[str, Any] | None:
         """Return the engine's answer to a request, or None for an error.
 
-        If the request has not begun after `timeout_s`, it is withdrawn, and has no effect.
+        If the request has not begun after `timeout_s`, it is cancelled, and has no effect.
         """
         answered: asyncio.Future[Reply] = self._loop.create_future()
         pending = PendingRequest(session_id, Request(op, kwargs=kwargs), partial(settle, answered))
         self._engine.submit([pending])
         await asyncio.wait([answered], timeout=timeout_s)
         if not answered.done():
-            self._engine.withdraw(pending)
-            if not pending.begun:
+            if self._engine.queue.cancel(pending):
                 return None
             await answered
         reply = answered.result()
@@ -249,7 +249,7 @@ class SessionMigrator:
         self._loop = loop
         self._closed = False
         self._lock = threading.Lock()
-        self._callbacks: dict[str, list[tuple[Callable[[], None], UserOf]]] = {}  # by session, until its search is over
+        self._callbacks: dict[str, list[_Callback]] = {}  # by session, until its search is over
         self._next_query: dict[str, asyncio.Future[_Answers]] = {}  # sessions of the next query
         self._callers: Counter[str] = Counter()  # number of running searches by caller
         self._unannounced: dict[str, int] = {}  # steps of begun episodes that are not announced yet, by session
@@ -348,30 +348,39 @@ class SessionMigrator:
         self._threads.shutdown(wait=False, cancel_futures=True)
 
     async def _search(self, session_id: str) -> None:
+        """Search for the session, and if it is not found, once more for the requests that joined the search late."""
+        searching = True
+        while searching:
+            with self._lock:
+                waiting = tuple(self._callbacks.get(session_id, ()))
+            try:
+                await self._find(session_id)
+            except VLAgentsError as error:
+                logger.warning("session %s: %s", session_id, error)
+            except Exception:
+                logger.exception("session %s: could not be fetched", session_id)
+            finally:
+                searching = self._finish(session_id, waiting)
+
+    async def _find(self, session_id: str) -> None:
+        """Take the session over from the replica that has it, unless there is none, or no waiting request fits it."""
         misses = 0  # consecutive attempts that found no holder; after two, the session is not moving either
-        try:
-            begun = self._loop.time()
-            for attempt in itertools.count():
-                if attempt:
-                    await asyncio.sleep(ON_ITS_WAY_S)
-                    if self._engine.sessions.held([session_id]):  # another replica has given it to this one
-                        break
-                await self.held.wait_until_left(session_id)
-                holders = await self._holders(session_id, await self._answers(session_id))
-                for version, peer in holders[1:]:
-                    if version < holders[0][0]:
-                        self._spawn(self._answer(peer.ask(HeldSessions.drop_older, {session_id: holders[0][0][0]})))
-                if holders and await self._move(session_id, holders[0][1]):
-                    break
-                misses = 0 if holders or self.held.is_leaving(session_id) else misses + 1
-                if misses == 2 or (attempt >= _ATTEMPTS and self._loop.time() > begun + ARRIVAL_S):
-                    break
-        except VLAgentsError as error:
-            logger.warning("session %s: %s", session_id, error)
-        except Exception:
-            logger.exception("session %s: could not be fetched", session_id)
-        finally:
-            self._finish(session_id)
+        begun = self._loop.time()
+        for attempt in itertools.count():
+            if attempt:
+                await asyncio.sleep(ON_ITS_WAY_S)
+                if self._engine.sessions.held([session_id]):  # another replica has given it to this one
+                    return
+            await self.held.wait_until_left(session_id)
+            holders = await self._holders(session_id, await self._answers(session_id))
+            for version, peer in holders[1:]:
+                if version < holders[0][0]:
+                    self._spawn(self._answer(peer.ask(HeldSessions.drop_older, {session_id: holders[0][0][0]})))
+            if holders and await self._move(session_id, holders[0][1]):
+                return
+            misses = 0 if holders or self.held.is_leaving(session_id) else misses + 1
+            if misses == 2 or (attempt >= _ATTEMPTS and self._loop.time() > begun + ARRIVAL_S):
+                return
 
     async def _fetch_from(self, session_id: str, holder: str) -> bool:
         """Fetch a session from the replica called `holder`, which offers it; return whether it is here."""
@@ -520,14 +529,27 @@ class SessionMigrator:
             for then in announced:
                 then()
 
-    def _finish(self, session_id: str) -> None:
+    def _finish(self, session_id: str, waiting: Collection[_Callback] | None = None) -> bool:
+        """Call the callbacks of a session whose search is over; if it was not found, only those of `waiting`.
+
+        Returns:
+            Whether requests have joined the search since those of `waiting`. The other replicas' answers may be older.
+        """
+        later: list[_Callback] = []
+        found = self._engine.sessions.held([session_id])
         with self._lock:
             callbacks = self._callbacks.pop(session_id, [])
+            if waiting is not None and not (found or self._closed):
+                later = [callback for callback in callbacks if callback not in waiting]
+                callbacks = [callback for callback in callbacks if callback in waiting]
+            if later:
+                self._callbacks[session_id] = later
         for then, _ in callbacks:
             try:
                 then()
             except Exception:
                 logger.exception("session %s: its request could not go on", session_id)
+        return bool(callbacks and later)  # without any of `waiting`, the later ones have a search of their own already
 
     def _spawn(self, work: Coroutine[Any, Any, Any]) -> asyncio.Task[Any]:
         task = self._loop.create_task(work)
