@@ -124,14 +124,20 @@ class Replica:
         self._busy = False
         self._turn()
 
-    def receive(self, request: Request, session_id: str, answer: Callable[[list[Reply]], None], timed: bool) -> None:
-        """A client's request: `timed` as over HTTP, else as over a connection, where only the queue knows deadlines."""
+    def receive(
+        self, request: Request, session_id: str, answer: Callable[[list[Reply]], None], timed: bool
+    ) -> Callable[[], Any]:
+        """A client's request: `timed` as over HTTP, else as over a connection, where only the queue knows deadlines.
+
+        Returns what the end of its connection does.
+        """
         sender = Sender(self.engine, "http", session_id, connected=False, caller=NoKey.OPEN)
         if timed:
             task = self.loop.create_task(ask(sender, [request]))
-            task.add_done_callback(lambda done: answer(done.result()))
-        else:
-            send(sender, [request], answer)
+            task.add_done_callback(lambda done: None if done.cancelled() else answer(done.result()))
+            return task.cancel
+        send(sender, [request], answer)
+        return lambda: None
 
 
 class Link:
@@ -227,6 +233,11 @@ class World:
         for when, name in self.plan.faults:
             self.outside.call_at(when, self._fault, name)
 
+    @property
+    def clocks_agree(self) -> bool:
+        """Has no replica's clock been set?"""
+        return not any(replica.clock_error_s for replica in self.replicas)
+
     def delay_s(self) -> float:
         """Of a message."""
         if self.draw.random() < self.plan.late:
@@ -303,7 +314,7 @@ class World:
     def send(
         self, op: Op, session_id: str, obs: Obs, *, link: Link | None, steady: bool, timed: bool, **fields: Any
     ) -> asyncio.Future[Reply]:
-        """A client's request; its answer may never come."""
+        """A client's request; its answer may never come. A client that cancels the answer closes its connection."""
         answer: asyncio.Future[Reply] = self.outside.create_future()
         replica = self.route(session_id, steady) if link is None else link.replica
 
@@ -312,7 +323,8 @@ class World:
 
         def deliver() -> None:
             if replica.alive:
-                replica.receive(Request(op, obs, **fields), session_id, answered, timed)
+                end = replica.receive(Request(op, obs, **fields), session_id, answered, timed)
+                answer.add_done_callback(lambda done: self.transport(None, replica, end) if done.cancelled() else None)
 
         if link is None:
             self.transport(None, replica, deliver)
