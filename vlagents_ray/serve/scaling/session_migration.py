@@ -511,23 +511,24 @@ class SessionMigrator:
             return None
 
     async def _announce_all(self) -> None:
+        announced: list[Callable[[], None]] = []
         try:
             await asyncio.sleep(_GATHER_S)
-        finally:  # also if the task is cancelled, as the replica stops
-            with self._lock:
-                begun, self._unannounced = self._unannounced, {}
-                announced, self._announced = self._announced, []
-            self._spawn(self._announce(begun, announced))
-
-    async def _announce(self, begun: dict[str, int], announced: list[Callable[[], None]]) -> None:
-        try:
+            begun, announced = self._take_unannounced()
             peers = [] if self._closed else await self._peers()
             if peers:
                 answers = [self._spawn(self._answer(peer.ask(HeldSessions.drop_older, begun))) for peer in peers]
                 await asyncio.wait(answers, timeout=_OTHERS_S)
-        finally:
-            for then in announced:
+        finally:  # also if the task is cancelled, as the replica stops
+            for then in announced or self._take_unannounced()[1]:
                 then()
+
+    def _take_unannounced(self) -> tuple[dict[str, int], list[Callable[[], None]]]:
+        """Return the steps of the begun episodes, by session, and what to call once those are announced."""
+        with self._lock:
+            begun, self._unannounced = self._unannounced, {}
+            announced, self._announced = self._announced, []
+        return begun, announced
 
     def _finish(self, session_id: str, waiting: Collection[_Callback] | None = None) -> bool:
         """Call the callbacks of a session whose search is over; if it was not found, only those of `waiting`.
