@@ -120,8 +120,9 @@ def test_sigterm_while_ray_starts_interrupts_the_command() -> None:
             signal.raise_signal(signal.SIGTERM)
 
 
-def test_ctrl_c_while_modules_are_imported_ends_the_command_without_a_traceback() -> None:
-    command = [sys.executable, "-X", "importtime", "-c", "from vlagents_ray.cli import main; main()", "policies"]
+@pytest.mark.parametrize("words", [["policies"], ["robot", "http://127.0.0.1:9"]], ids=["policies", "robot"])
+def test_ctrl_c_while_modules_are_imported_ends_the_command_without_a_traceback(words: list[str]) -> None:
+    command = [sys.executable, "-X", "importtime", "-c", "from vlagents_ray.cli import main; main()", *words]
     with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
         assert process.stderr is not None
         for line in process.stderr:

@@ -1,4 +1,4 @@
-"""One Ctrl-C or one SIGTERM ends an evaluation, whichever call hangs; finished episodes keep their results."""
+"""One Ctrl-C or one SIGTERM ends a command, whichever call hangs: episodes keep their results, a robot is stopped."""
 
 from __future__ import annotations
 
@@ -76,6 +76,27 @@ class Close(Policy):
 WITH_RAY = [pytest.mark.ray, pytest.mark.slow]
 
 
+def interrupted(words: list[str], number: signal.Signals, folder: Path) -> tuple[int, str]:
+    """Run a command until its file `hangs` exists, send it one signal; returns its status and what it printed."""
+    command = subprocess.Popen(
+        [sys.executable, "-m", "vlagents_ray", *words],
+        cwd=folder,
+        env=os.environ | {"PYTHONPATH": os.pathsep.join([str(folder), *sys.path])},
+        stdin=subprocess.DEVNULL,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        text=True,
+    )
+    with command:
+        try:
+            wait_for(lambda: (folder / "hangs").exists() or command.poll() is not None, START_S)
+            command.send_signal(number)
+            printed, _ = command.communicate(timeout=END_S)
+        finally:
+            command.kill()
+    return command.returncode, printed
+
+
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 @pytest.mark.parametrize(
     ("policy", "workers", "finished"),
@@ -92,24 +113,49 @@ def test_one_signal_ends_an_evaluation_that_hangs(
 ) -> None:
     (tmp_path / "own.py").write_text(MODULE)
     options = f"--episodes {EPISODES} --env-set max_steps=2 --video none --workers {workers} --out out".split()
-    evaluation = subprocess.Popen(
-        [sys.executable, "-m", "vlagents_ray", "eval", "tabletop", "--policy", f"own:{policy}", *options],
-        cwd=tmp_path,
-        env=os.environ | {"PYTHONPATH": os.pathsep.join([str(tmp_path), *sys.path])},
-        stdout=subprocess.PIPE,
-        stderr=subprocess.STDOUT,
-        text=True,
-    )
-    with evaluation:
-        try:
-            wait_for(lambda: (tmp_path / "hangs").exists() or evaluation.poll() is not None, START_S)
-            evaluation.send_signal(number)
-            printed, _ = evaluation.communicate(timeout=END_S)
-        finally:
-            evaluation.kill()
-    assert evaluation.returncode == 130, printed
+    words = ["eval", "tabletop", "--policy", f"own:{policy}", *options]
+    status, printed = interrupted(words, number, tmp_path)
+    assert status == 130, printed
     assert "Traceback" not in printed
     [error] = [line for line in printed.splitlines() if line.startswith("error ")]
     assert error == f"error interrupted after {finished} of {EPISODES} episodes; go on with --resume --out out"
     summary = json.loads((tmp_path / "out" / "summary.json").read_text())
     assert (summary["state"], summary["totals"][0]["episodes"]) == ("interrupted", finished)
+
+
+ARM = """
+import numpy as np
+from own import hang
+from vlagents_ray import Obs
+
+
+class Starting:
+    def __init__(self):
+        hang()
+
+    observe = apply = stop = lambda *_: None
+
+
+class Observing:
+    def observe(self):
+        hang()
+
+    def apply(self, action):
+        pass
+
+    def stop(self):
+        print("the arm stops", flush=True)
+"""
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize(("arm", "stops"), [("Starting", False), ("Observing", True)])
+def test_one_signal_ends_a_check_of_a_robot_that_hangs(
+    arm: str, stops: bool, number: signal.Signals, tmp_path: Path
+) -> None:
+    (tmp_path / "own.py").write_text(MODULE)
+    (tmp_path / "arm.py").write_text(ARM)
+    status, printed = interrupted(["robot", "check", f"arm:{arm}"], number, tmp_path)
+    assert status == 128 + number, printed
+    assert "Traceback" not in printed
+    assert ("the arm stops" in printed) == stops

@@ -15,24 +15,41 @@ import pytest
 from certificates import authority
 
 from vlagents_ray import RemoteAgent
-from vlagents_ray.errors import ConfigError, PolicyUnavailable, VLAgentsError
+from vlagents_ray.errors import ConfigError, PolicyUnavailable, UnknownApp, VLAgentsError
 from vlagents_ray.learn import Publisher
 from vlagents_ray.serve.ports import free_port
 
 TIMEOUT_S = 1.0
 
 
+class WithoutPaths(http.server.BaseHTTPRequestHandler):
+    """A server that has no application at any path."""
+
+    protocol_version = "HTTP/1.1"
+
+    def do_GET(self) -> None:
+        self.send_error(404)
+
+    def log_message(self, *_: object) -> None: ...
+
+
 @contextlib.contextmanager
-def http_server(context: ssl.SSLContext | None = None, host: str = "127.0.0.1") -> Iterator[int]:
-    with http.server.ThreadingHTTPServer((host, 0), http.server.BaseHTTPRequestHandler) as server:
+def http_server(
+    context: ssl.SSLContext | None = None,
+    host: str = "127.0.0.1",
+    handler: type[http.server.BaseHTTPRequestHandler] = http.server.BaseHTTPRequestHandler,
+) -> Iterator[int]:
+    with http.server.ThreadingHTTPServer((host, 0), handler) as server:
         server.handle_error = lambda *_: None  # type: ignore[method-assign]
         if context is not None:
             server.socket = context.wrap_socket(server.socket, server_side=True)
         thread = threading.Thread(target=server.serve_forever)
         thread.start()
-        yield server.server_port
-        server.shutdown()
-        thread.join()
+        try:
+            yield server.server_port
+        finally:
+            server.shutdown()
+            thread.join()
 
 
 @pytest.fixture(scope="module")
@@ -83,3 +100,8 @@ def test_a_name_that_the_certificate_does_not_have_is_named_with_the_cure(tmp_pa
 def test_weights_for_a_port_that_speaks_tls_are_told_the_url(ports: dict[str, int]) -> None:
     with pytest.raises(ConfigError, match=f"write https://127.0.0.1:{ports['TLS']}"):
         Publisher(f"http://127.0.0.1:{ports['TLS']}").push({"w": np.zeros(1, np.float32)})
+
+
+def test_weights_for_an_application_that_does_not_exist_name_the_path() -> None:
+    with http_server(handler=WithoutPaths) as port, pytest.raises(UnknownApp, match="no application at this path"):
+        Publisher(f"http://127.0.0.1:{port}/raech").push({"w": np.zeros(1, np.float32)})

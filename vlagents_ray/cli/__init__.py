@@ -12,12 +12,17 @@ from types import FrameType
 
 def main() -> None:
     """Run the console script; name the packages to install if only the light install is there."""
+    default = signal.signal(signal.SIGINT, _end_at_once)  # until a command has its own: `cli.console.errors`
     if sys.argv[1:2] == ["robot"]:  # the light install has it, and Ctrl-C in it stops the robot
         from vlagents_ray.cli.robot import main as robot
 
         find_modules_here()
-        sys.exit(robot(sys.argv[2:]))
-    signal.signal(signal.SIGINT, _end_at_once)  # until a command has its own handler: `cli.console.errors`
+        signal.signal(signal.SIGINT, default)
+        try:
+            sys.exit(robot(sys.argv[2:]))
+        except KeyboardInterrupt:
+            sys.stderr.write("error interrupted\n")
+            sys.exit(130)
     try:
         from vlagents_ray.cli.main import app
     except ModuleNotFoundError as error:

@@ -76,7 +76,8 @@ def main(arguments: Sequence[str]) -> int:
     if arguments[:1] == ["check"]:
         from vlagents_ray.cli.robot_check import main as check
 
-        return check(arguments[1:])
+        with _ended_by_signals():
+            return check(arguments[1:])
     options = parse(arguments)
     if options.env is not None:
         from vlagents_ray.cli.simulated_robot import drive

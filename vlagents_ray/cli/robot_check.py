@@ -32,9 +32,9 @@ UNDECLARED = 3  # exit status
 def main(arguments: Sequence[str]) -> int:
     """Run the command, and return its exit status."""
     parser = command_parser()
-    options = parse_all(parser, arguments)
+    options = parse_all(parser, arguments, {"--report": "the page is written by --out FILE"})
     if (options.robot is None) == (options.ros is None):
-        parser.error("want a robot by name, or one behind topics of ROS 2 (--ros FILE)")
+        parser.error("want a robot, as my_arm:MyArm, lerobot:TYPE or mujoco:ARM, or one behind ROS 2 (--ros FILE)")
     try:
         with contextlib.ExitStack() as stack:
             if options.json:  # standard output is for the document alone, without the questions to the operator

@@ -283,7 +283,7 @@ def test_a_rate_is_kept_by_name_over_all_connections(file: Path, monkeypatch: py
     callers = [keys.check(token, "noop") for _ in range(4)]
     for caller in callers:
         caller.admit()
-    with pytest.raises(TooManyRequests) as refused:
+    with pytest.raises(TooManyRequests, match="send fewer, or ask the operator") as refused:
         callers[0].admit()
     assert refused.value.retry_after_s == pytest.approx(0.25)
     callers[0].admit(free=True)

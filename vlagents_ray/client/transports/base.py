@@ -9,8 +9,9 @@ import select
 import socket
 import time
 from collections.abc import Sequence
-from typing import Any, Literal, Protocol
+from typing import Any, Literal, Protocol, get_args
 
+from vlagents_ray.errors import InvalidInput
 from vlagents_ray.images.codecs import JPEG, LOSSLESS, RAW, ImageCodec
 from vlagents_ray.interface import Obs
 from vlagents_ray.protocol.messages import Reply, Request
@@ -123,6 +124,8 @@ class CodecChoice:
         if isinstance(requested, ImageCodec):
             self.codec = requested
         elif self._compressed is None:
+            if requested not in get_args(CodecName):
+                raise InvalidInput(f"codec: got {requested!r}, want one of {list(get_args(CodecName))}")
             self.codec = ImageCodec(requested)
 
     def connected(self, *, near: bool) -> None:

@@ -99,7 +99,7 @@ def open_websocket(url: str, credentials: Credentials, timeout_s: float) -> Prox
     except ssl.SSLError as error:
         raise tls_failure(url, error) from error
     except InvalidStatus as error:
-        if error.response.status_code in (401, 403, 429):
+        if error.response.status_code in (401, 403, 404, 429):
             kind = error.response.headers.get("content-type", "")
             raise refusal(error.response.status_code, kind, bytes(error.response.body or b"")) from error
         raise PolicyUnavailable(f"{url}: refused with HTTP {error.response.status_code}") from error

@@ -136,7 +136,10 @@ class Keys:
                 least_s, most_s = _THROTTLED_S
                 self._unread_until[key.name] = now + min(most_s, max(least_s, wait_s))
         if wait_s > 0:
-            error = TooManyRequests(f"key {key.name!r}: over {key.rate:g} requests a second; wait {wait_s:.2g} s")
+            error = TooManyRequests(
+                f"key {key.name!r}: over {key.rate:g} requests a second; wait {wait_s:.2g} s, send fewer, or ask the "
+                f"operator of the server for a key with a higher rate"
+            )
             error.retry_after_s = wait_s
             raise error
 
