@@ -38,11 +38,11 @@ from vlagents_ray.policies.adapters import CONFIG as ADAPTER_CONFIG
 from vlagents_ray.policies.adapters import WEIGHTS as ADAPTER_WEIGHTS
 from vlagents_ray.policies.reference import Reference
 from vlagents_ray.policies.reference.checkpoint import CONFIG, WEIGHTS
-from vlagents_ray.policies.upstream import Upstream
 from vlagents_ray.serve.launch.deployment_file import deployment
 from vlagents_ray.serve.launch.server import running_server
 from vlagents_ray.serve.ports import free_port
 from vlagents_ray.weights.safetensors import read_values, write_values
+from vlagents_ray_dialects.upstream import Upstream
 
 STANDARD = "eager, in this process"
 APP = "reference"

@@ -23,12 +23,12 @@ from benchmarks.round_trips import RoundTripsOfAll, in_turns
 from vlagents_ray.cli.console import errors, progress
 from vlagents_ray.client.agent import RemoteAgent
 from vlagents_ray.interface import Obs
-from vlagents_ray.policies.upstream import Upstream
 from vlagents_ray.serve.launch.deployment_file import deployment
 from vlagents_ray.serve.launch.server import running_server
 from vlagents_ray.serve.models.agent_copies import AgentCopies
 from vlagents_ray.serve.ports import free_port
-from vlagents_ray.wire import openpi
+from vlagents_ray_dialects.messages import openpi
+from vlagents_ray_dialects.upstream import Upstream
 
 DIRECT, QUEUE, SERVER = "directly", "policy upstream", "server of ours"
 _WARM_UP = 50

@@ -21,7 +21,7 @@ from rich.console import Console
 from websockets.sync.server import serve
 
 from vlagents_ray.evaluate import EvalConfig, evaluate, print_summary
-from vlagents_ray.policies.upstream import Upstream
+from vlagents_ray_dialects.upstream import Upstream
 
 MAPPING = {  # our names on the left, the server's on the right
     "cameras": {"front": "observation/image"},

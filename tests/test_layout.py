@@ -77,6 +77,7 @@ def test_a_plugin_asks_for_the_package_of_its_own_version() -> None:
         "lerobot_policy_vlagents",
         "vlagents_ray_arro",
         "vlagents-ray-cluster",
+        "vlagents-ray-dialects",
         "vlagents-ray-sims",
     ]
     assert {project["version"] for project in found} == {ours}

@@ -133,11 +133,6 @@ POLICIES: dict[str, RegistryEntry] = {
         wants="torch",
         weights=True,
     ),
-    "upstream": RegistryEntry(
-        "vlagents_ray.policies.upstream:Upstream",
-        "any model behind openpi, RoboArena, GR00T, OpenVLA, vla-eval, vlagents, SGLang, vLLM-Omni or FlashRT",
-        wants="that server",
-    ),
     "noop": RegistryEntry("vlagents_ray.policies.noop:Noop"),
     "random": RegistryEntry("vlagents_ray.policies.random:Random"),
     "scripted": RegistryEntry("vlagents_ray.policies.scripted:Scripted"),
@@ -177,23 +172,11 @@ WRAPPERS: dict[str, RegistryEntry] = {
     "absolute_actions": RegistryEntry("vlagents_ray.policies.absolute_actions:AbsoluteActions"),
 }
 
-# Other systems' protocols: the names under `dialects` in a deployment file. If several serve the server's root path,
-# the first enabled one receives it.
-DIALECTS: dict[str, RegistryEntry] = {
-    "openpi": RegistryEntry("vlagents_ray.serve.dialects.openpi:OpenPiDialect"),
-    "roboarena": RegistryEntry("vlagents_ray.serve.dialects.openpi:RoboArenaDialect"),
-    "openvla": RegistryEntry("vlagents_ray.serve.dialects.openvla:OpenVLADialect"),
-    "vla_eval": RegistryEntry("vlagents_ray.serve.dialects.vla_eval:VlaEvalDialect"),
-    "gr00t": RegistryEntry("vlagents_ray.serve.dialects.gr00t:GR00TDialect"),
-    "vlagents": RegistryEntry("vlagents_ray.serve.dialects.vlagents:VlagentsDialect"),
-    "lerobot": RegistryEntry("vlagents_ray.serve.dialects.lerobot:LeRobotDialect"),
-}
-
 _BUILT_IN: dict[str, dict[str, RegistryEntry]] = {
     "policies": POLICIES,
     "wrappers": WRAPPERS,
     "envs": ENVS,
-    "dialects": DIALECTS,
+    "dialects": {},  # other systems' protocols, the names under `dialects` in a deployment file
     "commands": {},  # those of this package are in `cli.main`
     "replica": {},  # parts of a replica
 }

@@ -16,11 +16,11 @@ import pytest
 
 from vlagents_ray import Act, Obs, RemoteAgent, VLAgentsError
 from vlagents_ray.errors import BY_CODE
-from vlagents_ray.policies.upstream.client import ClientOptions
-from vlagents_ray.policies.upstream.http import OpenVLAClient
 from vlagents_ray.protocol.frame_layout import pack, unpack
 from vlagents_ray.protocol.frames import CONTENT_TYPE, decode_replies, encode_replies
 from vlagents_ray.protocol.messages import DEFAULT_LIMITS, PROTOCOL_VERSION, Reply
+from vlagents_ray_dialects.upstream.client import ClientOptions
+from vlagents_ray_dialects.upstream.http import OpenVLAClient
 
 METADATA: dict[str, Any] = {
     "protocol": PROTOCOL_VERSION,

@@ -11,7 +11,7 @@ from golden import png
 from tests.golden.masks import masked
 from tests.golden.scenarios import Send, asks, gets, http, scenario
 from tests.golden.traces import Step, Trace, read
-from vlagents_ray.wire import gr00t, openpi, openvla, rpyc, vla_eval, vlagents
+from vlagents_ray_dialects.messages import gr00t, openpi, openvla, rpyc, vla_eval, vlagents
 
 PIXELS = np.full((8, 8, 3), 7, np.uint8)
 JOINTS = np.array([0.25, -0.5], np.float32)

@@ -17,7 +17,7 @@ from websockets.sync.client import connect
 
 from vlagents_ray.serve.launch.deployment_file import IMPORT_PATH, read_deployment
 from vlagents_ray.serve.launch.server import Server
-from vlagents_ray.wire import openpi as openpi_codec
+from vlagents_ray_dialects.messages import openpi as openpi_codec
 
 CALLS = 12
 DIALECTS = {

@@ -33,9 +33,9 @@ from vlagents_ray import Obs, RemoteAgent
 from vlagents_ray.protocol.frames import CONTENT_TYPE, decode_replies, encode_requests
 from vlagents_ray.protocol.messages import Request
 from vlagents_ray.serve.launch.server import Server
-from vlagents_ray.wire import openpi as openpi_codec
-from vlagents_ray.wire import openvla as openvla_codec
-from vlagents_ray.wire import vla_eval as vla_eval_codec
+from vlagents_ray_dialects.messages import openpi as openpi_codec
+from vlagents_ray_dialects.messages import openvla as openvla_codec
+from vlagents_ray_dialects.messages import vla_eval as vla_eval_codec
 
 FRAMES = int(os.environ.get("VLAGENTS_FUZZ_FRAMES", "2800"))
 ANSWER_S = 60.0

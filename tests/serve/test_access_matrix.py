@@ -11,7 +11,7 @@ from api_key_replica import WAYS, KeyedReplica, keyed_replica
 from dialect_server import ALL
 
 from vlagents_ray.protocol.messages import OPS
-from vlagents_ray.registry import DIALECTS
+from vlagents_ray.registry import names
 
 PAGE = Path(__file__).parents[2] / "docs" / "keys.md"
 CREDENTIALS = 9
@@ -77,7 +77,7 @@ def test_the_table_names_every_way_in(replica: KeyedReplica) -> None:
     new = routes - {"/openapi.json"} - named - {f"/v1/{op}" for op in OPS}
     assert not new, "WAYS of tests/support/api_key_replica.py tries them, docs/keys.md has their cells"
     with_ports = {"gr00t", "vlagents", "lerobot"}
-    assert set(DIALECTS) == {*ALL, *with_ports}, "`keyed_replica` serves a new one, WAYS tries it"
+    assert set(names("dialects")) == {*ALL, *with_ports}, "`keyed_replica` serves a new one, WAYS tries it"
 
 
 def _routes(replica: KeyedReplica) -> list[object]:

@@ -23,7 +23,7 @@ from gr00t_client import PolicyClient
 from benchmarks.processes import cpu_seconds
 from vlagents_ray.client.transports.shm import ShmTransport
 from vlagents_ray.protocol.messages import Request
-from vlagents_ray.wire import lerobot
+from vlagents_ray_dialects.messages import lerobot
 
 pytestmark = [pytest.mark.alone, pytest.mark.slow, pytest.mark.integration]
 

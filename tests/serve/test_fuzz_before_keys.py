@@ -38,9 +38,9 @@ from rpyc_client import LOCAL, ROOT, TUPLE, VALUE, call, document, request
 from vlagents_ray.interface import Obs
 from vlagents_ray.protocol.frames import CONTENT_TYPE, encode_requests
 from vlagents_ray.protocol.messages import LocalAddress, Request
-from vlagents_ray.wire import rpyc
-from vlagents_ray.wire import vla_eval as vla_eval_codec
-from vlagents_ray.wire.rpyc import Handler
+from vlagents_ray_dialects.messages import rpyc
+from vlagents_ray_dialects.messages import vla_eval as vla_eval_codec
+from vlagents_ray_dialects.messages.rpyc import Handler
 
 SEQUENCES = int(os.environ.get("VLAGENTS_FUZZ_SEQUENCES", many(3000)))
 SEED = int(os.environ.get("VLAGENTS_FUZZ_SEED", "1"))

@@ -77,18 +77,19 @@ from vlagents_ray.protocol.messages import (
 )
 from vlagents_ray.serve.access import api_keys
 from vlagents_ray.serve.access.api_keys import NoKey
-from vlagents_ray.serve.dialects import gr00t
 from vlagents_ray.serve.dialects.base import GatewayContext
 from vlagents_ray.serve.endpoints.shm import ShmServer, UnixConnection
 from vlagents_ray.serve.endpoints.websocket import WebSocketServer
 from vlagents_ray.serve.engine.admission import Admission, ArrivingBytes, MessageAdmission, NeedsDecodingThread
 from vlagents_ray.serve.engine.engine import Engine
 from vlagents_ray.serve.engine.sender import REFUSALS
-from vlagents_ray.wire import gr00t as gr00t_codec
-from vlagents_ray.wire import json_numpy, msgpack
-from vlagents_ray.wire import openpi as openpi_codec
-from vlagents_ray.wire import openvla as openvla_codec
-from vlagents_ray.wire import vla_eval as vla_eval_codec
+from vlagents_ray.wire import json_numpy
+from vlagents_ray_dialects import gr00t
+from vlagents_ray_dialects.messages import gr00t as gr00t_codec
+from vlagents_ray_dialects.messages import msgpack
+from vlagents_ray_dialects.messages import openpi as openpi_codec
+from vlagents_ray_dialects.messages import openvla as openvla_codec
+from vlagents_ray_dialects.messages import vla_eval as vla_eval_codec
 
 JPEG = jpeg_png.encode_jpeg(np.full((32, 32, 3), 9, np.uint8))
 PNG = jpeg_png.encode_png(np.full((32, 32, 3), 9, np.uint8))

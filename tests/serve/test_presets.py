@@ -13,9 +13,9 @@ from vlagents_ray.contract import ActionSpec, Contract
 from vlagents_ray.errors import InvalidObservation
 from vlagents_ray.interface import Obs
 from vlagents_ray.serve.config.dialects import presets
-from vlagents_ray.serve.dialects.gr00t import nested_mapping
-from vlagents_ray.wire import gr00t as gr00t_codec
 from vlagents_ray.wire.mapping import KeyMapping, lookup, matches
+from vlagents_ray_dialects.gr00t import nested_mapping
+from vlagents_ray_dialects.messages import gr00t as gr00t_codec
 
 TASK = "put the bowl on the stove"
 _RANDOM = np.random.default_rng(15)

@@ -11,7 +11,7 @@ import pytest
 from eval_fakes import wait_for
 from leaving_clients import ACTED, BOUND_S, CLIENTS, GATEWAYS, HELD, OTHERS, LeavingClient, StoppableServer, seconds_of
 
-from vlagents_ray.registry import DIALECTS, dialect_class
+from vlagents_ray.registry import dialect_class, names
 from vlagents_ray.serve.dialects.base import RouteDialect
 
 SITUATIONS = ("idle", "in flight", "waiting", "half a message")
@@ -96,11 +96,11 @@ def test_no_act_is_executed_for_a_client_that_left_before_it_began(name: str, si
 
 
 def test_the_table_has_each_endpoint() -> None:
-    ports = {name for name in DIALECTS if not issubclass(dialect_class(name), RouteDialect)}
+    ports = {name for name in names("dialects") if not issubclass(dialect_class(name), RouteDialect)}
     assert ports == {name.lower() for name in GATEWAYS}
     paths = {
         path
-        for name in DIALECTS
+        for name in names("dialects")
         if issubclass(cls := dialect_class(name), RouteDialect)
         for path, method in cls.paths.items()
         if method in ("stream", "act")

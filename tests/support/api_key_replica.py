@@ -66,7 +66,7 @@ from vlagents_ray.serve.observers.live_view import Fleet, ReplicaView
 from vlagents_ray.serve.ports import free_port, reserve
 from vlagents_ray.serve.weights import PushResult
 from vlagents_ray.weights.safetensors import ValueSpec, header_of, read_header
-from vlagents_ray.wire import vla_eval as vla_eval_codec
+from vlagents_ray_dialects.messages import vla_eval as vla_eval_codec
 
 ANSWER_S = 10.0
 LIMITS = Limits(body_bytes=2**20)

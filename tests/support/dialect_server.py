@@ -12,21 +12,21 @@ from starlette.testclient import TestClient
 
 from vlagents_ray.interface import Agent
 from vlagents_ray.protocol.messages import Limits
-from vlagents_ray.registry import DIALECTS, dialect_class
+from vlagents_ray.registry import dialect_class, names
 from vlagents_ray.serve.access.api_keys import Keys
 from vlagents_ray.serve.config.dialects import DialectArgs
 from vlagents_ray.serve.dialects.base import ReplicaContext, RouteDialect, dialect_routes
 from vlagents_ray.serve.endpoints.access_middleware import AccessMiddleware
 from vlagents_ray.serve.endpoints.http import build_http_app
 from vlagents_ray.serve.engine.engine import Engine
-from vlagents_ray.wire import openpi as openpi_codec
-from vlagents_ray.wire import openvla as openvla_codec
-from vlagents_ray.wire import vla_eval as vla_eval_codec
+from vlagents_ray_dialects.messages import openpi as openpi_codec
+from vlagents_ray_dialects.messages import openvla as openvla_codec
+from vlagents_ray_dialects.messages import vla_eval as vla_eval_codec
 
 LIMITS = Limits(body_bytes=300_000, pixels=64 * 64)
 METADATA = {"policy": "mirror", "version": "0", "protocol": 1, "checkpoint": None}
 ALL: dict[str, Any] = {  # those on the server's own port, with settings where tests need them
-    **{name: {} for name in DIALECTS if issubclass(dialect_class(name), RouteDialect)},
+    **{name: {} for name in names("dialects") if issubclass(dialect_class(name), RouteDialect)},
     "openpi": {"mapping": "openpi-libero", "metadata": {"reset_pose": [0.5]}},
     "roboarena": {"mapping": "openpi-libero"},
     "vla_eval": {"observation_params": {"send_state": True}},

@@ -49,8 +49,6 @@ from vlagents_ray.protocol.websocket_frames import frame_head
 from vlagents_ray.registry import dialect_class
 from vlagents_ray.serve.access.api_keys import Keys, NoKey
 from vlagents_ray.serve.config.dialects import DialectArgs
-from vlagents_ray.serve.dialects import gr00t, vlagents
-from vlagents_ray.serve.dialects import lerobot as lerobot_dialect
 from vlagents_ray.serve.dialects.base import GatewayContext, ReplicaContext, dialect_routes
 from vlagents_ray.serve.endpoints.access_middleware import AccessMiddleware
 from vlagents_ray.serve.endpoints.front import FrontMiddleware
@@ -62,10 +60,13 @@ from vlagents_ray.serve.engine.engine import Engine
 from vlagents_ray.serve.observers.live_page import page_server
 from vlagents_ray.serve.observers.live_view import Fleet
 from vlagents_ray.serve.ports import reserve
-from vlagents_ray.wire import gr00t as gr00t_wire
-from vlagents_ray.wire import json_numpy, lerobot, rpyc, zmtp
-from vlagents_ray.wire import openpi as openpi_codec
-from vlagents_ray.wire import vla_eval as vla_eval_codec
+from vlagents_ray.wire import json_numpy
+from vlagents_ray_dialects import gr00t, vlagents
+from vlagents_ray_dialects import lerobot as lerobot_dialect
+from vlagents_ray_dialects.messages import gr00t as gr00t_wire
+from vlagents_ray_dialects.messages import lerobot, rpyc, zmtp
+from vlagents_ray_dialects.messages import openpi as openpi_codec
+from vlagents_ray_dialects.messages import vla_eval as vla_eval_codec
 
 HEIGHT, WIDTH = 2304, 4096  # of the largest image
 GATEWAYS_IN_FLIGHT = 256 * 2**20  # bytes; a key or an address may take half of it

@@ -53,7 +53,7 @@ from vlagents_ray.serve.endpoints.shm import ShmServer
 from vlagents_ray.serve.endpoints.websocket import WebSocketServer
 from vlagents_ray.serve.engine.engine import Engine
 from vlagents_ray.serve.ports import free_port, reserve
-from vlagents_ray.wire import vla_eval as vla_eval_codec
+from vlagents_ray_dialects.messages import vla_eval as vla_eval_codec
 
 BOUND_S = 5.0  # nothing waits for longer
 HELD = 250  # the policy acts on pictures from this brightness on when its gate opens

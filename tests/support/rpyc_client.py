@@ -9,8 +9,9 @@ from typing import Any
 
 import numpy as np
 
-from vlagents_ray.wire import json_numpy, rpyc
-from vlagents_ray.wire.rpyc import Handler
+from vlagents_ray.wire import json_numpy
+from vlagents_ray_dialects.messages import rpyc
+from vlagents_ray_dialects.messages.rpyc import Handler
 
 ROOT = ("vlagents_ray.Policy", 1, 1)
 VALUE, TUPLE, LOCAL, REMOTE = 1, 2, 3, 4

@@ -12,7 +12,7 @@ from hypothesis import example, given
 from hypothesis import strategies as st
 
 from vlagents_ray.errors import MalformedMessage
-from vlagents_ray.wire import zmtp
+from vlagents_ray_dialects.messages import zmtp
 
 zmq = pytest.importorskip("zmq")
 

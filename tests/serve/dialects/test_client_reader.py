@@ -14,8 +14,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from vlagents_ray.errors import MessageTooLarge, Overloaded
-from vlagents_ray.serve.dialects.client_reader import ClientReader
 from vlagents_ray.serve.engine.admission import Admission
+from vlagents_ray_dialects.client_reader import ClientReader
 
 Pair = tuple[socket.socket, socket.socket]  # the client's end and the gateway's
 

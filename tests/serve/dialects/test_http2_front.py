@@ -17,9 +17,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 from lerobot_messages import AsyncClient, robot_saw
 
-from vlagents_ray.serve.dialects import acceptor, http2_front
-from vlagents_ray.serve.dialects.http2_front import Http2Front
-from vlagents_ray.wire.http2 import PREFACE, FrameCounter
+from vlagents_ray_dialects import acceptor, http2_front
+from vlagents_ray_dialects.http2_front import Http2Front
+from vlagents_ray_dialects.messages.http2 import PREFACE, FrameCounter
 
 SETTINGS = b"\0\0\0\x04" + bytes(5)
 Connect = Callable[[], socket.socket]

@@ -6,6 +6,7 @@ the section of all dialects by name: a registered name, or "module:Class".
 
 from __future__ import annotations
 
+import logging
 from collections import Counter
 from collections.abc import Iterator, Mapping
 from functools import cache
@@ -14,12 +15,14 @@ from typing import Any, ClassVar
 from pydantic import BaseModel, Field, field_validator, model_validator
 
 from vlagents_ray.contract import Contract
-from vlagents_ray.errors import ConfigError
+from vlagents_ray.errors import ConfigError, VLAgentsError
+from vlagents_ray.naming import did_you_mean
 from vlagents_ray.protocol.messages import RankName
 from vlagents_ray.registry import dialect_class, names, require
 from vlagents_ray.serve.config.registered import RegisteredArgs
-from vlagents_ray.wire import presets as wire_presets
 from vlagents_ray.wire.mapping import KeyMapping
+
+logger = logging.getLogger(__name__)
 
 MappingSetting = str | dict[str, Any]
 
@@ -128,31 +131,48 @@ class DialectArgs(RegisteredArgs):
 
 
 def read_mapping(value: str | Mapping[str, Any]) -> KeyMapping:
-    """Read a mapping: a preset's name, or an object, whose fields replace those of its `preset` if it names one.
+    """Read a mapping.
 
     The presets are the mappings of known clients. Each dialect defines its own, with the units and orders of its
     system's examples.
 
+    Args:
+        value: A preset's name, or an object. The fields of an object with `preset` override those of that preset.
+
     Raises:
         ConfigError: The preset is unknown, or the object is invalid.
     """
-    return wire_presets.read_mapping(value, _preset)
+    if not isinstance(value, (str, Mapping)):
+        raise ConfigError(f"mapping: got {type(value).__name__}, want a preset's name or an object")
+    fields = {"preset": value} if isinstance(value, str) else dict(value)
+    base = _preset(fields.pop("preset")) if "preset" in fields else {}
+    return KeyMapping.from_json({**base, **fields})
 
 
 @cache
 def presets() -> dict[str, KeyMapping]:
     """Return the presets of all registered dialects, by name."""
-    return {name: KeyMapping.from_json(one) for stated in _stated() for name, one in stated.items()}
+    found = {}
+    for of_dialect in _presets_by_dialect():
+        found.update({name: KeyMapping.from_json(mapping) for name, mapping in of_dialect.items()})
+    return found
 
 
-def _preset(name: str) -> Mapping[str, Any]:
-    for stated in _stated():
-        if name in stated:
-            return stated[name]
-    raise wire_presets.unknown_preset(name, presets())
+def _preset(name: object) -> Mapping[str, Any]:
+    for of_dialect in _presets_by_dialect():
+        if isinstance(name, str) and name in of_dialect:
+            return of_dialect[name]
+    known = presets()
+    meant = did_you_mean(str(name), known)
+    raise ConfigError(f"mapping: got {name!r}, want one of the presets {sorted(known)}, or an object{meant}")
 
 
-def _stated() -> Iterator[Mapping[str, Mapping[str, Any]]]:
-    """Yield the presets of each dialect, those of this package first, so that no plugin is imported to find them."""
+def _presets_by_dialect() -> Iterator[Mapping[str, Mapping[str, Any]]]:
+    """Yield the presets of each dialect; one that cannot be imported is left out, and its error is logged."""
     for name in names("dialects"):
-        yield dialect_class(name).presets
+        try:
+            dialect = dialect_class(name)
+        except VLAgentsError as error:
+            logger.warning("dialect %r: its presets are left out: %s", name, error)
+            continue
+        yield dialect.presets

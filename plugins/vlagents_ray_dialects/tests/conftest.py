@@ -1,0 +1,5 @@
+"""The fixtures of tests of dialects."""
+
+from dialect_fixtures import everything, one_replica, open_dialect
+
+__all__ = ["everything", "one_replica", "open_dialect"]

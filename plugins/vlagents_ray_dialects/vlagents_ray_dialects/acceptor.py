@@ -1,0 +1,78 @@
+"""The thread that accepts the clients of a dialect with its own port, at a bounded rate."""
+
+from __future__ import annotations
+
+import logging
+import socket
+import threading
+import time
+from collections.abc import Callable
+
+from vlagents_ray.serve.token_bucket import TokenBucket
+from vlagents_ray_dialects.client_reader import shut_down
+
+logger = logging.getLogger(__name__)
+
+TICK_S = 0.5  # period at which a dialect checks its clients
+_ACCEPTED_PER_S = 50.0  # maximum number of connections in a second; each takes a thread and about a millisecond
+_END_S = 3.0
+
+
+class Acceptor:
+    """Accepts connections until it is closed; those above the rate wait in the listener's backlog."""
+
+    def __init__(
+        self,
+        name: str,
+        listener: socket.socket,
+        add: Callable[[socket.socket], None],
+        check_clients: Callable[[], None] = lambda: None,
+    ) -> None:
+        """Begin to accept.
+
+        Args:
+            name: Name of the dialect.
+            listener: A bound socket, which the acceptor closes.
+            add: Serves a connection, or closes it; it must not block.
+            check_clients: Called on the same thread every `TICK_S`.
+        """
+        self._name, self._listener = name, listener
+        self._add, self._check_clients = add, check_clients
+        self._closing = threading.Event()
+        listener.listen()
+        listener.settimeout(TICK_S)
+        self._thread = threading.Thread(target=self._run, name=name, daemon=True)
+        self._thread.start()
+
+    def alive(self) -> bool:
+        """Return whether connections are accepted."""
+        return self._thread.is_alive()
+
+    def close(self) -> None:
+        """Accept no more connections, and close the listener."""
+        self._closing.set()
+        shut_down(self._listener)
+        self._thread.join(_END_S)
+
+    def _run(self) -> None:
+        accepting = TokenBucket(_ACCEPTED_PER_S, time.monotonic())
+        checked_at = float("-inf")
+        with self._listener:
+            while not self._closing.is_set():
+                now = time.monotonic()
+                if now - checked_at >= TICK_S:
+                    checked_at = now
+                    self._check_clients()
+                if (wait_s := accepting.take(now)) > 0:
+                    time.sleep(wait_s)
+                    continue
+                try:
+                    connection, _ = self._listener.accept()
+                except TimeoutError:
+                    continue
+                except OSError as error:
+                    if not self._closing.is_set():
+                        logger.warning("%s: cannot accept a client: %s", self._name, error)
+                        time.sleep(0.1)  # other connections must end first if descriptors are exhausted
+                    continue
+                self._add(connection)

@@ -1,0 +1,432 @@
+"""GR00T's `PolicyClient`s over ZeroMQ's protocol: a session and a thread for each connection."""
+
+from __future__ import annotations
+
+import contextlib
+import logging
+import re
+import socket
+import threading
+import time
+from collections.abc import Iterable
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
+from typing import Any
+
+from pydantic import Field
+
+from vlagents_ray.contract import Contract
+from vlagents_ray.errors import MalformedMessage, MessageTooLarge, Overloaded, PolicyUnavailable, VLAgentsError
+from vlagents_ray.protocol.websocket_frames import CONTROL_FRAMES, CONTROL_FRAMES_PER_S
+from vlagents_ray.registry import require
+from vlagents_ray.serve.access.api_keys import Caller, NoKey
+from vlagents_ray.serve.config.dialects import MappingSetting, PortConfig
+from vlagents_ray.serve.dialects.base import GatewayContext, PortDialect
+from vlagents_ray.serve.engine.admission import Admission
+from vlagents_ray.serve.token_bucket import TokenBucket
+from vlagents_ray.wire.mapping import KeyMapping, matches
+from vlagents_ray_dialects.acceptor import Acceptor
+from vlagents_ray_dialects.client_reader import ClientReader, set_keep_alive, share_of, shut_down
+from vlagents_ray_dialects.gateway_sessions import GatewayClient, GatewayClients, internal_error
+from vlagents_ray_dialects.messages import gr00t, zmtp
+from vlagents_ray_dialects.messages.gr00t import PRESETS, GR00TRequest, Observations
+
+logger = logging.getLogger(__name__)
+
+_FOLDER = re.compile(r"^(video|state|language)\.")
+# The parts of a message before its payload. A REQ socket adds an empty one, a DEALER socket those of its program.
+Envelope = tuple[bytes, ...]
+_ENVELOPES: tuple[Envelope, ...] = ((), (b"",))  # those of clients that are connected directly
+_MOST_PARTS, _MOST_PART_BYTES = 4, 256  # of an envelope that is answered with an error; others end the connection
+_HANDSHAKE_S = 5.0
+_MESSAGE_S = 30.0  # maximum time of a message, from its first byte to its last
+_SEND_S = 10.0  # maximum time for a client to accept an answer
+_END_S = 3.0  # maximum time for the answers to requests when the dialect ends
+_LINGER_S = 1.0  # and for refusing those that have arrived by then
+_STRANGERS = 64  # maximum number of connections without a valid key; a further one ends the oldest
+_STRANGER_S = 30.0  # time within which a connection must send a valid key
+_REFUSALS = 64  # messages without a valid key after which a connection is closed
+_REFUSAL_S = 0.1  # time for which a connection is not read after such a message, as reading a key takes time
+
+
+class GR00TConnection(GatewayClient):
+    """One connection of a client, from its first byte to its last; a thread processes its requests in order.
+
+    It is a stranger until one of its messages has a valid key, or needs none; then it is one of the dialect's clients.
+    """
+
+    def __init__(self, dialect: GR00TDialect, connection: socket.socket) -> None:
+        super().__init__(dialect.context)
+        self._dialect, self._connection = dialect, connection
+        # flat: whether the client's last keys were N1.5's
+        self._mapping, self._flat = nested_mapping(dialect.mapping)
+        self._is_robot = dialect.config.rank == "robot"
+        self._share = share_of(connection)  # whose share of the bytes in flight its messages take
+        self._reader = ClientReader(connection, dialect.of_strangers, robot=True)
+        self._commands = TokenBucket(CONTROL_FRAMES_PER_S, time.monotonic(), CONTROL_FRAMES)
+        self._valid_until = time.monotonic() + _STRANGER_S  # time at which a stranger is disconnected, s
+        self._refused = 0  # number of messages without a valid key
+        self._sending = threading.Lock()  # guards sending, and the next field
+        self._waiting: Envelope | None = None  # the envelope of the request without an answer
+        self._answered = threading.Condition()
+        self.is_client = False  # whether it counts among the dialect's clients
+        self.thread = threading.Thread(target=self._run, name="gr00t-client", daemon=True)
+
+    def end(self) -> None:
+        """Process what has arrived, then end the sessions and the connection."""
+        self.is_client = False
+        shut_down(self._connection, socket.SHUT_RD)
+
+    def cut_off(self, reason: str) -> None:
+        """End the connection at once; may be called on any thread."""
+        logger.info("gr00t: a connection is closed: %s", reason)
+        shut_down(self._connection)
+
+    def wait_answered(self, until: float) -> None:
+        """Wait until no request is unanswered, or until a time of `time.monotonic()`, s."""
+        with self._answered:
+            self._answered.wait_for(lambda: not self._unanswered, max(0.0, until - time.monotonic()))
+
+    def refuse_waiting(self, error: VLAgentsError) -> None:
+        """Answer the request that is being processed, if there is one, with an error; may be called on any thread."""
+        self._send(_error(error))
+
+    def _run(self) -> None:
+        try:
+            self._connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+            set_keep_alive(self._connection)
+            self._greet()
+            while (head := self._receive_head()) is not None:
+                self._process(*head)
+        except (VLAgentsError, OSError) as error:
+            logger.info("gr00t: disconnected a client: %s", error)
+        except Exception:
+            logger.exception("gr00t: disconnected a client")
+        finally:
+            self._dialect.remove(self)
+            shut_down(self._connection)
+            self._connection.close()
+            self.sessions.close()
+
+    # ZeroMQ's protocol.
+
+    def _greet(self) -> None:
+        deadline = time.monotonic() + _HANDSHAKE_S
+        self._connection.settimeout(_HANDSHAKE_S)
+        self._connection.sendall(zmtp.GREETING)
+        greeting = bytearray()
+        for size in (1, 10, zmtp.GREETING_BYTES - 11):  # old peers send less, and then wait
+            greeting += self._read(size, _HANDSHAKE_S, deadline)
+            zmtp.check_greeting(greeting)
+        self._connection.sendall(zmtp.write_ready())
+        flags = zmtp.read_flags(self._read(1, _HANDSHAKE_S, deadline)[0])
+        name, properties = self._read_command(flags, deadline)
+        if name != b"READY":
+            raise MalformedMessage(f"zmtp: expected READY, got {name!r}")
+        zmtp.check_ready(properties)
+
+    def _read(self, length: int, silent_s: float, deadline: float) -> memoryview:
+        data = self._reader.read(length, silent_s, deadline)
+        if data is None:
+            raise ConnectionResetError("the client disconnected")
+        return data
+
+    def _read_command(self, flags: zmtp.FrameFlags, deadline: float) -> tuple[bytes, bytes]:
+        size = zmtp.read_size(self._read(flags.size_bytes, _MESSAGE_S, deadline))
+        if not flags.is_command or size > zmtp.COMMAND_BYTES:
+            raise MalformedMessage(f"zmtp: expected a command of at most {zmtp.COMMAND_BYTES} bytes, got {size}")
+        return zmtp.read_command(self._read(size, _MESSAGE_S, deadline))
+
+    def _receive_head(self) -> tuple[Envelope, int, float] | None:
+        """Receive a message up to its payload.
+
+        Returns:
+            Its envelope, the size of its payload in bytes, and the time at which the payload must have arrived, s; None
+            if the client has disconnected.
+        """
+        envelope: list[bytes] = []
+        deadline = float("inf")
+        while True:
+            wait_s = self._context.idle_s if self.is_client else max(0.0, self._valid_until - time.monotonic())
+            first = self._reader.read(zmtp.HEAD_BYTES, wait_s, deadline)
+            if first is None:
+                return None
+            deadline = min(deadline, time.monotonic() + _MESSAGE_S)
+            flags = zmtp.read_flags(first[0])
+            if flags.is_command:
+                self._process_command(*self._read_command(flags, deadline))
+                if not envelope:
+                    deadline = float("inf")
+                continue
+            size = zmtp.read_size(self._read(flags.size_bytes, _MESSAGE_S, deadline))
+            if not flags.has_more:
+                if size > self._context.limits.body_bytes:
+                    raise MessageTooLarge(
+                        f"gr00t: a message of {size} bytes, the limit is {self._context.limits.body_bytes}"
+                    )
+                return tuple(envelope), size, deadline
+            if len(envelope) == _MOST_PARTS or sum(map(len, envelope)) + size > _MOST_PART_BYTES:
+                raise MalformedMessage(
+                    f"gr00t: expected an envelope of at most {_MOST_PARTS} parts and {_MOST_PART_BYTES} bytes"
+                )
+            envelope.append(bytes(self._read(size, _MESSAGE_S, deadline)))
+
+    def _process_command(self, name: bytes, content: bytes) -> None:
+        if self._commands.take(time.monotonic()) > 0:
+            raise MalformedMessage(f"zmtp: more than {CONTROL_FRAMES} commands at once")
+        if name == b"PING":
+            with self._sending:
+                self._connection.settimeout(_SEND_S)
+                self._connection.sendall(zmtp.write_pong(content))
+
+    def _process(self, envelope: Envelope, size: int, deadline: float) -> None:
+        """Receive the payload of a message, and answer it."""
+        with self._sending:
+            self._waiting = envelope
+        with self._answered:
+            self._unanswered = 1
+        try:
+            try:
+                payload = self._read(size, _MESSAGE_S, deadline)
+            except Overloaded as error:
+                answer = _error(error)
+            else:
+                answer = self._answer(envelope, payload)
+        finally:  # before the client has the answer, since another may then have its place
+            with self._answered:
+                self._unanswered = 0
+                self._used = time.monotonic()
+                self._answered.notify_all()
+        self._send(answer)
+        time.sleep(self.sessions.throttled_s())
+
+    def _send(self, answer: bytes) -> None:
+        """Send the answer to the current request, unless it has one."""
+        with self._sending:
+            envelope, self._waiting = self._waiting, None
+            if envelope is not None:
+                self._connection.settimeout(_SEND_S)
+                self._connection.sendall(zmtp.write_message([*envelope, answer]))
+
+    # The messages.
+
+    def _answer(self, envelope: Envelope, payload: memoryview) -> bytes:
+        try:
+            if self._dialect.is_stopping:
+                raise _stopping()
+            if envelope not in _ENVELOPES:
+                self._count_refusal()
+                raise MalformedMessage(
+                    f"gr00t: got an envelope of {len(envelope)} parts, want none or an empty one; connect each client "
+                    f"directly, without a ZeroMQ proxy"
+                )
+            self._identify(payload)
+            admission = self._context.admission
+            admission.hold(len(payload), self._is_robot, 0, self._share)
+            try:
+                self.sessions.begin()
+                request = gr00t.read_request(payload, self._context.limits)
+                return gr00t.pack(self._value(request), packed=request.packed)
+            finally:
+                admission.release(len(payload), self._share)
+        except VLAgentsError as error:
+            return _error(error)
+        except Exception:  # noqa: BLE001 - logged, and answered
+            return gr00t.pack({"error": internal_error("gr00t")})
+
+    def _identify(self, payload: memoryview) -> None:
+        """Set the sessions' caller by the key of a message; raise an error unless it is valid, or none is needed."""
+        check = self._context.check
+        if isinstance(check, NoKey):
+            self.sessions.show(check, None)
+        else:
+            try:
+                key = self._dialect.read_key(payload, of_client=self.is_client)
+                caller = check(key)
+            except VLAgentsError:
+                self._count_refusal()
+                raise
+            self.sessions.show(caller, key)
+            if isinstance(caller, Caller):
+                self._share = caller.name
+                self._is_robot = self._dialect.config.rank == "robot" and caller.rank != "simulation"
+        if not self.is_client:
+            self._dialect.admit(self)
+        self._reader.set_sender(self._context.admission, self._share, robot=self._is_robot)
+
+    def _count_refusal(self) -> None:
+        """Count a message without a valid key; end the connection after too many."""
+        self._refused += 1
+        if self._refused >= _REFUSALS:
+            self.end()
+        else:
+            time.sleep(_REFUSAL_S)
+
+    def _value(self, request: GR00TRequest) -> Any:
+        if request.endpoint == "ping":
+            return {"status": "ok", "message": "Server is running"}
+        if request.endpoint == "get_modality_config":
+            return gr00t.modality_config(self._modalities(), flat=self._flat)
+        if request.endpoint == "reset":
+            self.sessions.restart()
+            return {}
+        return self._act(gr00t.read_observations(request.data))
+
+    def _act(self, asked: Observations) -> Any:
+        mapping, contract = self._mapping, self._context.contract
+        self._flat = asked.flat
+        seen = [mapping.obs(gr00t.newest(one), self._context.limits, contract) for one in asked.each]
+        if not self.sessions.begun:
+            mapping.warn_of_unread_cameras(gr00t.newest(asked.each[0]), "gr00t")
+        acts = self.sessions.act_batch([obs for obs, _ in seen], [text for _, text in seen])
+        spec = None if contract is None else contract.action
+        info = {"done": [act.done for act in acts]} | {"timing": acts[0].info.get("timing", {})}
+        return gr00t.write_actions([mapping.actions(act.action, spec) for act in acts], asked, info)
+
+    def _modalities(self) -> dict[str, tuple[list[str], list[int]]]:
+        mapping, contract = self._mapping, self._context.contract
+        contract = contract or Contract()
+        cameras = [(name, camera.key) for name, camera in mapping.cameras.items()]
+        state = [(name, part.key) for name, parts in mapping.state.items() for part in parts]
+        chunk = contract.chunk or 1
+        return {
+            "video": (_theirs(cameras, contract.cameras or {}), [0]),
+            "state": (_theirs(state, contract.state or {}), [0]),
+            "action": (list(mapping.action) or ["action"], list(range(chunk))),
+            "language": ([gr00t.TEXT_KEY], [0]),
+        }
+
+
+def _error(error: VLAgentsError) -> bytes:
+    return gr00t.pack({"error": f"{error.code}: {error}"})
+
+
+def _stopping() -> PolicyUnavailable:
+    return PolicyUnavailable("the server is stopping; send the request again to its successor")
+
+
+def _theirs(entries: Iterable[tuple[str, str]], needed: Iterable[str]) -> list[str]:
+    """Return the client's names of the policy's cameras or states; `*` in the mapping keeps the policy's names."""
+    found: dict[str, None] = {}
+    for ours, key in entries:
+        names = needed if "*" in key else [key.rpartition("/")[2]]
+        found |= dict.fromkeys(name for name in names if "*" not in key or matches(name, ours))
+    return list(found)
+
+
+def nested_mapping(mapping: KeyMapping) -> tuple[KeyMapping, bool]:
+    """Return a mapping with the keys of `gr00t.newest`, and whether it had N1.5's flat keys, such as `video.front`."""
+
+    def folders(key: str) -> str:
+        return "|".join(_FOLDER.sub(r"\1/", one) for one in key.split("|"))
+
+    nested = replace(
+        mapping,
+        cameras={name: replace(one, key=folders(one.key)) for name, one in mapping.cameras.items()},
+        state={name: tuple(replace(one, key=folders(one.key)) for one in of) for name, of in mapping.state.items()},
+        gripper=mapping.gripper and replace(mapping.gripper, key=folders(mapping.gripper.key)),
+        instruction=mapping.instruction and f"language/{gr00t.TEXT_KEY}",
+        action={name.removeprefix("action."): one for name, one in mapping.action.items()},
+    )
+    return nested, nested.cameras != mapping.cameras or nested.state != mapping.state
+
+
+class GR00TDialectConfig(PortConfig):
+    """The settings of GR00T's ZeroMQ protocol, that of its `PolicyServer`."""
+
+    mapping: MappingSetting = "gr00t"
+    port: int = Field(default=5555, ge=1, le=65535)
+
+
+class GR00TDialect(PortDialect):
+    """GR00T's protocol, with one thread and one session per connection."""
+
+    Config = GR00TDialectConfig
+    clients = "GR00T"
+    summary = (
+        "A session is the connection, until it is idle; `reset` begins an episode, and a batch of B is B "
+        "sessions. `api_token` is the API key. An error is a map with `error`."
+    )
+    requires = ("msgpack",)
+    presets = PRESETS
+
+    def __init__(self, name: str, config: GR00TDialectConfig, context: GatewayContext) -> None:
+        super().__init__(name, config, context)
+        # Bytes of strangers' incomplete messages. One address may take half, which is the largest message.
+        self.of_strangers = Admission(2 * context.limits.body_bytes)
+        self._clients: GatewayClients[int, GR00TConnection] = GatewayClients(context)  # by `id`
+        self._lock = threading.Lock()  # guards the next two fields
+        self._connections: set[GR00TConnection] = set()
+        self._strangers: dict[GR00TConnection, None] = {}  # the connections that are no clients, the oldest first
+        self._stopping = threading.Event()  # whether new requests are refused
+        self._key_reader = ThreadPoolExecutor(1, "gr00t-keys")
+        self._acceptor: Acceptor | None = None
+
+    @property
+    def is_stopping(self) -> bool:
+        """Whether requests are refused, since the server is stopping."""
+        return self._stopping.is_set()
+
+    def serve(self, listener: socket.socket) -> None:
+        require("msgpack")
+        self._acceptor = Acceptor("gr00t", listener, self._add, self._clients.forget_quiet)
+
+    def alive(self) -> bool:
+        return self._acceptor is not None and self._acceptor.alive()
+
+    def close(self) -> None:
+        self._stopping.set()  # a client of this protocol waits for ever for an answer that does not come
+        until = time.monotonic() + _END_S
+        with self._lock:
+            connections = list(self._connections)
+        for connection in connections:
+            connection.wait_answered(until)
+        for connection in connections:
+            with contextlib.suppress(OSError):  # the client has disconnected
+                connection.refuse_waiting(_stopping())
+        if self._acceptor is not None:
+            self._acceptor.close()
+        with self._lock:
+            connections = list(self._connections)
+        for connection in connections:
+            connection.end()
+        until = time.monotonic() + _LINGER_S
+        for connection in connections:
+            connection.thread.join(max(0.0, until - time.monotonic()))
+            connection.cut_off("the server is stopping")
+        self._key_reader.shutdown(wait=False)
+
+    def read_key(self, payload: memoryview, *, of_client: bool) -> str | None:
+        """Return the API key in a message; None if it has none.
+
+        Those of strangers are read on one thread: each thread's heap would keep the memory of the largest message.
+        """
+        if of_client:
+            return gr00t.read_token(payload, self.context.limits)
+        return self._key_reader.submit(gr00t.read_token, payload, self.context.limits).result()
+
+    def admit(self, connection: GR00TConnection) -> None:
+        """Count a connection with a valid key among the clients; raise `PolicyUnavailable` if there are too many."""
+        self._clients.add(id(connection), lambda: connection)
+        connection.is_client = True
+        with self._lock:
+            self._strangers.pop(connection, None)
+
+    def remove(self, connection: GR00TConnection) -> None:
+        """Remove a connection that ends."""
+        self._clients.remove(id(connection))
+        with self._lock:
+            self._strangers.pop(connection, None)
+            self._connections.discard(connection)
+
+    def _add(self, connection: socket.socket) -> None:
+        client = GR00TConnection(self, connection)
+        with self._lock:
+            oldest = next(iter(self._strangers)) if len(self._strangers) >= _STRANGERS else None
+            if oldest is not None:
+                del self._strangers[oldest]
+            self._strangers[client] = None
+            self._connections.add(client)
+        if oldest is not None:
+            oldest.cut_off(f"{_STRANGERS} connections are without a valid key")
+        client.thread.start()

@@ -1,0 +1,173 @@
+"""What stands between the clients of a gRPC dialect and gRPC's server: a bound of connections and of frames.
+
+gRPC's library accepts and answers on native threads, as fast as a client sends: eight strangers who connect and send
+pings take both cores of a small machine. The front accepts at a bounded rate, forwards no connection before its HTTP/2
+preface, and reads no further from one that sends more small frames than a robot needs.
+"""
+
+from __future__ import annotations
+
+import logging
+import socket
+import struct
+import tempfile
+import threading
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+from vlagents_ray.errors import MalformedMessage
+from vlagents_ray.serve.token_bucket import TokenBucket
+from vlagents_ray_dialects.client_reader import set_keep_alive, share_of, shut_down
+from vlagents_ray_dialects.messages.http2 import PREFACE, FrameCounter
+
+logger = logging.getLogger(__name__)
+
+_SHORT_FOLDER = "/tmp"  # noqa: S108 - a name of a socket has 107 bytes; the folder in it is for this user only
+_HANDSHAKE_S = 5.0
+_SEND_S = 10.0  # maximum time for a client to accept a part of an answer
+_END_S = 3.0
+_READ_BYTES = 64 * 1024
+# A robot sends about four small frames with each request, and at most 7 at once. At 30 Hz, with two requests for each
+# observation, it sends 270 in a second.
+_FRAMES_PER_S = 300.0
+_FRAMES_AT_ONCE = 150
+_STRANGERS = 64  # maximum number of connections that are no clients; a further one ends the oldest
+
+
+class Http2Front:
+    """Forwards connections to a gRPC server on a Unix socket that only this user can reach."""
+
+    def __init__(self, name: str, is_client: Callable[[str], bool]) -> None:
+        """Prepare to forward; gRPC's server must listen at `address`.
+
+        Args:
+            name: Name of the dialect.
+            is_client: Returns whether gRPC's name of a peer, `ServicerContext.peer()`, is that of a client.
+        """
+        self.name = name
+        self._is_client = is_client
+        self._folder = tempfile.TemporaryDirectory(prefix="vlr-", dir=_SHORT_FOLDER)
+        self.path = str(Path(self._folder.name, "grpc"))
+        self._lock = threading.Lock()  # guards the next two fields
+        self._connections: dict[ForwardedConnection, None] = {}  # the oldest first
+        self._shares: dict[str, str] = {}  # by gRPC's name of the peer
+
+    @property
+    def address(self) -> str:
+        """The address for gRPC's server."""
+        return f"unix:{self.path}"
+
+    def add(self, client: socket.socket) -> None:
+        """Forward a connection on its own threads; end the oldest that is no client if there are too many."""
+        connection = ForwardedConnection(self, client)
+        with self._lock:
+            strangers = [other for other in self._connections if other.is_open and not self._is_client(other.peer)]
+            self._connections[connection] = None
+        if len(strangers) >= _STRANGERS:
+            strangers[0].end()
+        connection.thread.start()
+
+    def share_of(self, peer: str) -> str:
+        """Return the name under which a peer has a share of the bytes in flight: that of its address."""
+        with self._lock:
+            return self._shares.get(peer, "address unknown")
+
+    def set_share(self, peer: str, share: str) -> None:
+        """Set the name of a peer's share, before gRPC's server knows the peer."""
+        with self._lock:
+            self._shares[peer] = share
+
+    def remove(self, connection: ForwardedConnection) -> None:
+        """Remove a connection that has ended."""
+        with self._lock:
+            del self._connections[connection]
+            self._shares.pop(connection.peer, None)
+
+    def close(self) -> None:
+        """End all connections, and remove the socket."""
+        with self._lock:
+            connections = list(self._connections)
+        for connection in connections:
+            connection.end()
+        deadline = time.monotonic() + _END_S
+        for connection in connections:
+            connection.thread.join(max(0.0, deadline - time.monotonic()))
+        self._folder.cleanup()
+
+
+class ForwardedConnection:
+    """One connection of a client, and the one to gRPC's server that belongs to it."""
+
+    def __init__(self, front: Http2Front, client: socket.socket) -> None:
+        self._front, self._client = front, client
+        self._server = socket.socket(socket.AF_UNIX)
+        self._server.bind("")  # the kernel chooses a unique name, by which gRPC's server tells its peers apart
+        self.peer = f"unix-abstract:{self._server.getsockname()[1:].decode()}"
+        self._frames = FrameCounter()
+        self._allowed_frames = TokenBucket(_FRAMES_PER_S, time.monotonic(), _FRAMES_AT_ONCE)
+        self._ended = threading.Event()
+        self.thread = threading.Thread(target=self._run, name=f"{front.name}-requests", daemon=True)
+
+    @property
+    def is_open(self) -> bool:
+        """Whether the connection has not been ended."""
+        return not self._ended.is_set()
+
+    def end(self) -> None:
+        """End both connections at once; may be called on any thread."""
+        self._ended.set()
+        shut_down(self._client)
+        shut_down(self._server)
+
+    def _run(self) -> None:
+        answers = threading.Thread(target=self._forward_answers, name=f"{self._front.name}-answers", daemon=True)
+        try:
+            self._read_preface()
+            self._front.set_share(self.peer, share_of(self._client))
+            self._server.connect(self._front.path)
+            self._server.sendall(PREFACE)
+            answers.start()
+            self._forward_requests()
+        except (MalformedMessage, OSError) as error:
+            logger.info("%s: disconnected a client: %s", self._front.name, error)
+        finally:
+            self.end()
+            if answers.ident is not None:
+                answers.join()
+            self._front.remove(self)
+            self._client.close()
+            self._server.close()
+
+    def _read_preface(self) -> None:
+        deadline = time.monotonic() + _HANDSHAKE_S
+        preface = b""
+        while preface != PREFACE:
+            self._client.settimeout(max(0.001, deadline - time.monotonic()))
+            received = self._client.recv(len(PREFACE) - len(preface))
+            preface += received
+            if not received or not PREFACE.startswith(preface):
+                raise MalformedMessage("expected the preface of HTTP/2, got another one; use a client of gRPC")
+        self._client.settimeout(None)
+        self._client.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+        self._client.setsockopt(socket.SOL_SOCKET, socket.SO_SNDTIMEO, struct.pack("ll", int(_SEND_S), 0))
+        set_keep_alive(self._client)
+
+    def _forward_requests(self) -> None:
+        while data := self._client.recv(_READ_BYTES):
+            frames = self._frames.count(data)
+            if frames > _FRAMES_AT_ONCE:
+                raise MalformedMessage(f"expected at most {_FRAMES_AT_ONCE} small frames at once, got {frames}")
+            while (wait_s := self._allowed_frames.take(time.monotonic(), frames)) > 0:
+                if self._ended.wait(wait_s):
+                    return
+            self._server.sendall(data)
+
+    def _forward_answers(self) -> None:
+        try:
+            while data := self._server.recv(_READ_BYTES):
+                self._client.sendall(data)
+        except OSError as error:
+            logger.info("%s: disconnected a client: %s", self._front.name, error)
+        finally:
+            self.end()

@@ -1,0 +1,342 @@
+"""LeRobot's asynchronous inference over gRPC: a session for each connection of a robot client."""
+
+from __future__ import annotations
+
+import logging
+import socket
+import threading
+import time
+from collections.abc import Callable, Iterator, Mapping
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import AbstractContextManager, contextmanager
+from dataclasses import dataclass
+from functools import partial
+from typing import Any, ClassVar
+
+import numpy as np
+from pydantic import Field
+
+from vlagents_ray.errors import (
+    InvalidInput,
+    MalformedMessage,
+    MessageTooLarge,
+    NotReset,
+    PolicyUnavailable,
+    VLAgentsError,
+)
+from vlagents_ray.interface import Obs
+from vlagents_ray.registry import require
+from vlagents_ray.serve.access.api_keys import NoKey
+from vlagents_ray.serve.config.dialects import KeylessPortConfig, MappingSetting
+from vlagents_ray.serve.dialects.base import GatewayContext, PortDialect
+from vlagents_ray.serve.engine.admission import MessageAdmission
+from vlagents_ray.wire.mapping import KeyMapping
+from vlagents_ray_dialects.acceptor import Acceptor
+from vlagents_ray_dialects.gateway_sessions import GatewayClient, GatewayClients, internal_error
+from vlagents_ray_dialects.http2_front import Http2Front
+from vlagents_ray_dialects.messages import lerobot
+from vlagents_ray_dialects.messages.lerobot import PRESETS, PolicyInstructions, RobotObservation, TransferState
+
+logger = logging.getLogger(__name__)
+
+_WAIT_S = 2.0  # time that a request for actions waits for an observation, as at LeRobot's own server
+_HZ = 30.0  # rate of the actions' timestamps if the policy's contract has none, as at LeRobot's own server
+_UPLOAD_S = 30.0  # maximum time from an observation's first part to its last
+_END_S = 3.0
+_REQUESTS = 4  # maximum number of concurrent requests of one client; LeRobot's has two
+_HEARTBEAT_MS = 10_000
+_DETAILS = 500  # maximum number of characters of an error, which gRPC sends in a header of 8 KiB at most
+# HTTP status -> name of gRPC's; clients repeat a request by themselves after UNAVAILABLE or DEADLINE_EXCEEDED
+_STATUS = {
+    400: "INVALID_ARGUMENT",
+    403: "PERMISSION_DENIED",
+    404: "NOT_FOUND",
+    409: "FAILED_PRECONDITION",
+    413: "RESOURCE_EXHAUSTED",
+    422: "INVALID_ARGUMENT",
+    429: "RESOURCE_EXHAUSTED",
+    503: "UNAVAILABLE",
+    504: "DEADLINE_EXCEEDED",
+}
+
+
+@dataclass(slots=True)
+class _Waiting:
+    """An observation that the policy has not received yet."""
+
+    seen: RobotObservation
+    robot: PolicyInstructions
+    obs: Obs
+    instruction: str | None
+    admission: MessageAdmission
+
+
+class LeRobotConnection(GatewayClient):
+    """One client since its `Ready`. Its requests arrive on several threads, of which one at a time uses the session."""
+
+    def __init__(self, context: GatewayContext, mapping: KeyMapping, checkpoint: str | None) -> None:
+        super().__init__(context)
+        self._mapping, self._checkpoint = mapping, checkpoint
+        self.sessions.show(NoKey.OPEN, None)  # the protocol has no key, and the deployment accepted that
+        self._robot: PolicyInstructions | None = None
+        self._acted = -1  # time step of the last observation that the policy received
+        self._waiting: _Waiting | None = None
+        self._arrival = threading.Condition()
+        self._acting = threading.Lock()
+        self._ended = False
+
+    @contextmanager
+    def request(self) -> Iterator[LeRobotConnection]:
+        """Count a request as unanswered within the context, and yield the client."""
+        with self._arrival:
+            self._unanswered += 1
+        try:
+            yield self
+        finally:
+            with self._arrival:
+                self._unanswered -= 1
+                self._used = time.monotonic()
+
+    def set_up(self, robot: PolicyInstructions) -> None:
+        """Set the policy instructions; raise `InvalidInput` if they name another checkpoint than the deployment."""
+        if self._checkpoint not in (None, robot.checkpoint):
+            raise InvalidInput(
+                f"pretrained_name_or_path: got {robot.checkpoint[:80]!r}, this server acts for {self._checkpoint!r}; "
+                "start the client with that"
+            )
+        logger.info("lerobot: a client of %r %r begins", robot.policy_type[:80], robot.checkpoint[:80])
+        self._robot = robot
+
+    def observe(self, data: bytes, admission: MessageAdmission) -> None:
+        """Store an observation for the next act, in place of an earlier one that the policy has not received yet.
+
+        An observation of a time step that the policy has received is ignored, unless the client has no action left.
+        The `admission` of the pickle is released when the observation is dropped or acted on.
+        """
+        if self._robot is None:
+            raise NotReset("SendPolicyInstructions: got none since Ready; start the client again")
+        admission.begin("act")
+        seen = lerobot.read_observation(data, admission)
+        if seen.timestep <= self._acted and not seen.must_go:
+            return
+        theirs = lerobot.frame(seen, self._robot)
+        obs, instruction = self._mapping.obs(theirs, self._context.limits, self._context.contract)
+        if not self.sessions.begun:
+            self._mapping.warn_of_unread_cameras(theirs, "lerobot")
+        with self._arrival:
+            earlier, self._waiting = self._waiting, _Waiting(seen, self._robot, obs, instruction, admission)
+            self._arrival.notify()
+        if earlier is not None:
+            earlier.admission.release()
+
+    def actions(self) -> bytes | None:
+        """Return the pickled actions for the newest observation; None if there is none within two seconds."""
+        deadline = time.monotonic() + _WAIT_S
+        if not self._acting.acquire(timeout=_WAIT_S):
+            return None
+        try:
+            with self._arrival:
+                self._arrival.wait_for(lambda: self._waiting or self._ended, deadline - time.monotonic())
+                waiting, self._waiting = self._waiting, None
+            return None if waiting is None or self._ended else self._act(waiting)
+        finally:
+            self._acting.release()
+            if self._ended:
+                self.end()
+
+    def end(self) -> None:
+        with self._arrival:
+            self._ended = True
+            self._waiting = None
+            self._arrival.notify_all()
+        if self._acting.acquire(blocking=False):
+            try:
+                self.sessions.close()
+            except Exception:
+                logger.exception("lerobot: a session did not end")
+            finally:
+                self._acting.release()
+
+    def _act(self, waiting: _Waiting) -> bytes:
+        contract, seen = self._context.contract, waiting.seen
+        before, self._acted = self._acted, max(self._acted, seen.timestep)
+        try:
+            act = self.sessions.act(waiting.obs, waiting.instruction)
+        except BaseException:
+            self._acted = before  # the client's next observation of this time step must not be ignored
+            raise
+        finally:
+            waiting.admission.release()
+        rows: np.ndarray = self._mapping.rows(act.action, None if contract is None else contract.action)
+        hz = (contract and contract.control_hz) or _HZ
+        return lerobot.write_chunk(rows[: waiting.robot.actions_per_chunk], seen.timestamp, seen.timestep, 1 / hz)
+
+
+class LeRobotDialectConfig(KeylessPortConfig):
+    """The settings of LeRobot's asynchronous inference, the protocol of its `RobotClient`."""
+
+    mapping: MappingSetting = "lerobot"
+    port: int = Field(default=8080, ge=1, le=65535)
+    checkpoint: str | None = Field(
+        default=None,
+        description="the `pretrained_name_or_path` that clients must state; unset: any, as it is not loaded: the "
+        "policy of the deployment acts",
+    )
+
+
+class LeRobotDialect(PortDialect):
+    """LeRobot's gRPC service; gRPC's threads process the requests, which arrive through an `Http2Front`."""
+
+    Config = LeRobotDialectConfig
+    clients = "LeRobot"
+    summary = (
+        "A session is the connection, until it is idle; an episode begins with `Ready` and with each new task. The "
+        "newest observation is acted on. Pickles are read as data: numbers, texts and numpy arrays."
+    )
+    scheme = "grpc"
+    requires = ("grpc",)
+    presets: ClassVar[Mapping[str, Mapping[str, Any]]] = PRESETS
+    config: LeRobotDialectConfig
+
+    def __init__(self, name: str, config: LeRobotDialectConfig, context: GatewayContext) -> None:
+        super().__init__(name, config, context)
+        self._clients: GatewayClients[str, LeRobotConnection] = GatewayClients(context)
+        self._uploads: dict[Any, float] = {}  # gRPC's context of each observation that is being received -> its start
+        self._server: Any = None
+        self._front: Http2Front | None = None
+        self._acceptor: Acceptor | None = None
+        self._closing = threading.Event()
+
+    def serve(self, listener: socket.socket) -> None:
+        grpc = require("grpc")
+        most = _REQUESTS * self.context.sessions
+        unary, stream = grpc.unary_unary_rpc_method_handler, grpc.stream_unary_rpc_method_handler
+        methods = {  # over plain bytes
+            "Ready": unary(partial(self._answer, grpc, self._ready)),
+            "SendPolicyInstructions": unary(partial(self._answer, grpc, self._set_up)),
+            "SendObservations": stream(partial(self._answer, grpc, self._observe)),
+            "GetActions": unary(partial(self._answer, grpc, self._act)),
+        }
+        self._server = grpc.server(
+            ThreadPoolExecutor(most, "lerobot-client"),
+            handlers=[grpc.method_handlers_generic_handler(lerobot.SERVICE, methods)],
+            options=[
+                ("grpc.max_concurrent_streams", _REQUESTS),
+                ("grpc.max_connection_idle_ms", int(1e3 * self.context.idle_s)),
+                ("grpc.server_handshake_timeout_ms", _HEARTBEAT_MS),
+                ("grpc.keepalive_time_ms", _HEARTBEAT_MS),
+                ("grpc.keepalive_timeout_ms", _HEARTBEAT_MS),
+                # a compressed message would be decompressed regardless of its size
+                ("grpc.compression_enabled_algorithms_bitset", 1),
+            ],
+            maximum_concurrent_rpcs=most,
+        )
+        self._front = Http2Front(self.name, lambda peer: self._clients.get(peer) is not None)
+        self._server.add_insecure_port(self._front.address)
+        self._server.start()
+        self._acceptor = Acceptor(self.name, listener, self._front.add, self._check_clients)
+
+    def alive(self) -> bool:
+        return self._acceptor is not None and self._acceptor.alive()
+
+    def close(self) -> None:
+        """Refuse further requests, answer those that have arrived, and end all sessions."""
+        self._closing.set()
+        if self._acceptor is not None:
+            self._acceptor.close()
+        stopped = None if self._server is None else self._server.stop(_END_S)  # then it ends the remaining requests
+        self._clients.end_all()
+        if stopped is not None:
+            stopped.wait()
+        if self._front is not None:
+            self._front.close()
+
+    def _answer(self, grpc: Any, method: Callable[[Any, Any], bytes | None], request: Any, context: Any) -> bytes:
+        """Return the reply to a request, or end the request with gRPC's status for the error."""
+        try:
+            return method(request, context) or lerobot.EMPTY
+        except VLAgentsError as error:
+            status, text = _STATUS.get(error.status, "INTERNAL"), f"{error.code}: {error}"
+        except Exception as error:  # noqa: BLE001 - logged, and answered
+            if isinstance(error, grpc.RpcError):  # the client is gone
+                return lerobot.EMPTY
+            status, text = "INTERNAL", internal_error("lerobot")
+        context.abort(getattr(grpc.StatusCode, status), text[:_DETAILS])
+        raise AssertionError  # abort raises
+
+    def _ready(self, _: bytes, context: Any) -> None:
+        if self._closing.is_set():
+            raise _stopping()
+        make = partial(LeRobotConnection, self.context, self.mapping, self.config.checkpoint)
+        self._clients.add(context.peer(), make)
+
+    def _set_up(self, message: bytes, context: Any) -> None:
+        with self._request(context) as client:
+            if (data := lerobot.read_data(message)) is None:
+                raise MalformedMessage("policy instructions: got none")
+            client.set_up(lerobot.read_instructions(data, self.context.limits))
+
+    def _observe(self, parts: Iterator[bytes], context: Any) -> None:
+        with self._request(context) as client:
+            robot = self.config.rank == "robot"
+            admission = MessageAdmission(
+                self.context.admission,
+                self.context.limits,
+                None,
+                robot=robot,
+                inline=False,
+                key=self._share_of(context),
+            )
+            self._uploads[context] = time.monotonic()
+            try:
+                data = _joined(parts, admission)
+            finally:
+                del self._uploads[context]
+            client.observe(data, admission)
+
+    def _act(self, _: bytes, context: Any) -> bytes | None:
+        with self._request(context) as client:
+            actions = client.actions()
+        if actions is None and self._closing.is_set():
+            raise _stopping()
+        return None if actions is None else lerobot.write_data(actions)
+
+    def _share_of(self, context: Any) -> str:
+        """Return the name under which a client without a key has a share of the bytes in flight."""
+        return "address unknown" if self._front is None else self._front.share_of(context.peer())
+
+    def _request(self, context: Any) -> AbstractContextManager[LeRobotConnection]:
+        """Return the context of a request, with its client, identified by its connection."""
+        if (client := self._clients.get(context.peer())) is None:
+            raise NotReset("Ready: got none over this connection, or it was idle for too long; start the client again")
+        return client.request()
+
+    def _check_clients(self) -> None:
+        """Remove clients that are gone, and end observations that take too long."""
+        self._clients.forget_quiet()
+        late = time.monotonic() - _UPLOAD_S
+        for context, begun in list(self._uploads.items()):
+            if begun < late:
+                context.cancel()
+
+
+def _stopping() -> PolicyUnavailable:
+    return PolicyUnavailable("the server is stopping; connect again")
+
+
+def _joined(messages: Iterator[bytes], admission: MessageAdmission) -> bytes:
+    """Return a pickle that arrives in several messages; each counts on arrival."""
+    parts: list[memoryview] = []
+    size, limit = 0, admission.limits.body_bytes
+    for message in messages:
+        state, data = lerobot.read_observation_part(message)
+        if state is TransferState.BEGIN and parts:
+            raise MalformedMessage("observation: begins twice")
+        size += len(data)
+        if size > limit:
+            raise MessageTooLarge(f"observation: more than {limit} bytes; send smaller images, or raise `limits`")
+        admission.receive(len(data))
+        parts.append(data)
+        if state is TransferState.END:
+            return b"".join(parts)
+    raise MalformedMessage("observation: ended before its last part")

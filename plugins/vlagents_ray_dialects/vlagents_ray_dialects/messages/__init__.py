@@ -1,0 +1,1 @@
+"""Other systems' messages as values, without sockets or a server."""

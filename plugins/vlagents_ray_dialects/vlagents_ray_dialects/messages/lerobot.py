@@ -1,0 +1,295 @@
+"""The pickled messages of LeRobot's asynchronous inference: policy instructions, observations and chunks of actions.
+
+Sources: `async_inference/helpers.py` and `robot_client.py` of LeRobot 0.4.4, which are equivalent in 0.6.1. A
+client pickles its data classes. They are read as data, see `pickles`, and the chunk is written as a pickle that refers
+to the client's own `TimedAction` and `torch.tensor`.
+"""
+
+from __future__ import annotations
+
+import enum
+import math
+import struct
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from vlagents_ray.errors import InvalidObservation, MalformedMessage, MessageTooLarge, MissingCamera, MissingState
+from vlagents_ray.protocol.frame_layout import Buffer
+from vlagents_ray.protocol.messages import Budget, Limits
+from vlagents_ray.protocol.values import is_number
+from vlagents_ray_dialects.messages.pickles import NUMPY_CALLS, Name, fields_of, read_pickle
+
+HELPERS = "lerobot.async_inference.helpers"
+SETUP, OBSERVATION = Name(HELPERS, "RemotePolicyConfig"), Name(HELPERS, "TimedObservation")
+_REQUESTS: Mapping[Name, Sequence[str]] = {
+    SETUP: (
+        "policy_type", "pretrained_name_or_path", "lerobot_features", "actions_per_chunk", "device", "rename_map",
+    ),
+    OBSERVATION: ("timestamp", "timestep", "observation", "must_go"),
+}  # fmt: skip
+_STEPS = 2**31  # time steps fit into a pickle's plain integers
+_SHOWN = 40  # largest number of a client's keys in an error, and of characters of each
+
+
+@dataclass(frozen=True, slots=True)
+class PolicyInstructions:
+    """A client's settings of itself and of the policy, sent before its first observation."""
+
+    policy_type: str
+    checkpoint: str  # the checkpoint that LeRobot's own server would load
+    state: tuple[str, ...]  # names of the numbers of `observation.state`, in order
+    cameras: tuple[str, ...]
+    actions_per_chunk: int
+
+
+@dataclass(frozen=True, slots=True)
+class RobotObservation:
+    timestamp: float  # the client's clock, s since 1970
+    timestep: int  # number of the last action that the client executed
+    values: Mapping[str, Any]  # numbers, texts and arrays by the robot's names
+    must_go: bool  # whether the client has no actions left
+
+
+def read_instructions(data: Buffer, limits: Limits) -> PolicyInstructions:
+    """Return the policy instructions in a pickle; raises `InvalidObservation` for features that are not served."""
+    stated = _pickled_fields(data, limits, SETUP)
+    policy_type, checkpoint = (_text(stated, name) for name in ("policy_type", "pretrained_name_or_path"))
+    rows, features, renames = (stated[name] for name in ("actions_per_chunk", "lerobot_features", "rename_map"))
+    if type(rows) is not int or rows < 1:
+        raise MalformedMessage(f"actions_per_chunk: got {_shown(rows)}, want an integer of 1 or more")
+    if not (isinstance(features, dict) and isinstance(renames, dict)):
+        raise MalformedMessage(f"lerobot_features, rename_map: got {_shown(features)}, {_shown(renames)}, want dicts")
+    if renames:
+        raise InvalidObservation("rename_map: got names, want none; rename them in dialects.lerobot.mapping")
+    state: tuple[str, ...] = ()
+    for name, feature in features.items():
+        if not isinstance(feature, dict):
+            raise MalformedMessage(f"lerobot_features: {name[:_SHOWN]!r}: got {_shown(feature)}, want a dict")
+        kind = _text(feature, "dtype")
+        if name == STATE and kind == "float32":
+            state = _names(feature)
+        elif not (name.startswith(IMAGES) and kind in ("image", "video")):
+            raise InvalidObservation(
+                f"lerobot_features: got {name[:_SHOWN]!r} of {kind[:_SHOWN]!r}, want {STATE!r} of float32, and "
+                f"images {IMAGES + 'NAME'!r}"
+            )
+    cameras = tuple(name.removeprefix(IMAGES) for name in features if name != STATE)
+    if len(cameras) > limits.cameras or len(state) > limits.state_values:
+        raise MessageTooLarge(
+            f"lerobot_features: got {len(cameras)} cameras and {len(state)} numbers of state, the limits are "
+            f"{limits.cameras} and {limits.state_values}"
+        )
+    return PolicyInstructions(policy_type, checkpoint, state, cameras, rows)
+
+
+def read_observation(data: Buffer, budget: Budget) -> RobotObservation:
+    """Return the observation in a pickle; its arrays are views of the pickle, and count in `budget`."""
+    stated = _pickled_fields(data, budget.limits, OBSERVATION)
+    timestamp, timestep, values, must_go = (stated[name] for name in _REQUESTS[OBSERVATION])
+    if not is_number(timestamp) or not math.isfinite(timestamp):
+        raise MalformedMessage(f"timestamp: got {_shown(timestamp)}, want a finite number")
+    if type(timestep) is not int or not 0 <= timestep < _STEPS:
+        raise MalformedMessage(f"timestep: got {_shown(timestep)}, want an integer in [0, 2**31)")
+    if type(must_go) is not bool:
+        raise MalformedMessage(f"must_go: got {_shown(must_go)}, want a bool")
+    if not isinstance(values, dict):
+        raise MalformedMessage(f"observation: got {_shown(values)}, want a dict")
+    for name, value in values.items():
+        if isinstance(value, np.ndarray):
+            budget.count(value.nbytes)
+        elif not (isinstance(value, (str, bool)) or is_number(value)):
+            raise MalformedMessage(
+                f"observation: {name[:_SHOWN]!r}: got {_shown(value)}, want a number, text or numpy array"
+            )
+    return RobotObservation(float(timestamp), timestep, values, must_go)
+
+
+def frame(observation: RobotObservation, robot: PolicyInstructions) -> dict[str, Any]:
+    """Convert an observation to LeRobot's names, as LeRobot's own server does before it calls a policy.
+
+    Returns:
+        `observation.state`, (D,) float32, in the order of the robot's features, `observation.images.NAME`, and `task`.
+
+    Raises:
+        MissingState, MissingCamera: The observation lacks a feature that the policy instructions state.
+        InvalidObservation: A value of the state is not a number.
+    """
+    values = observation.values
+    have = [name[:_SHOWN] for name in values][:_SHOWN]
+    found: dict[str, Any] = {}
+    if robot.state:
+        numbers = []
+        for name in robot.state:
+            if name not in values:
+                raise MissingState(name[:_SHOWN], have=have)
+            value = values[name]
+            if isinstance(value, np.ndarray) and value.size == 1:
+                value = value.item()
+            if not is_number(value):
+                raise InvalidObservation(f"{name[:_SHOWN]!r}: got {_shown(value)}, want a number")
+            numbers.append(value)
+        with np.errstate(over="ignore"):  # becomes infinite, as in LeRobot's own server
+            found[STATE] = np.array(numbers, np.float64).astype(np.float32)
+    for name in robot.cameras:
+        if name not in values:
+            raise MissingCamera(name[:_SHOWN], have=have)
+        found[IMAGES + name] = values[name]
+    if TASK in values:
+        found[TASK] = values[TASK]
+    return found
+
+
+def write_chunk(rows: np.ndarray, timestamp: float, timestep: int, period_s: float) -> bytes:
+    """Return the pickle of a chunk: a list of `TimedAction`, which the client unpickles.
+
+    The pickle has the form that LeRobot's server writes, except that each tensor is a call of `torch.tensor` with its
+    float32 numbers, which needs neither torch here nor an archive within the pickle.
+
+    Args:
+        rows: The chunk, (H, D) float32.
+        timestamp: Time of the observation and of the first action, s.
+        timestep: Number of the observation and of the first action.
+        period_s: Time between two actions, s.
+    """
+    if timestep + len(rows) > _STEPS:
+        raise InvalidObservation(f"timestep: got {timestep}, which leaves no numbers for {len(rows)} actions")
+    parts = [b"\x80\x02", _global(0, HELPERS, "TimedAction"), _global(1, "torch", "tensor"), b"]("]
+    for number, row in enumerate(rows):
+        values = b"".join(b"G" + struct.pack(">d", value) for value in row.tolist())
+        parts += [
+            b"h\0)\x81}(",
+            _text_opcodes("timestamp"), b"G", struct.pack(">d", timestamp + number * period_s),
+            _text_opcodes("timestep"), b"J", struct.pack("<i", timestep + number),
+            _text_opcodes("action"), b"h\1](", values, b"e\x85R",
+            b"ub",
+        ]  # fmt: skip
+    return b"".join([*parts, b"e."])
+
+
+def _text_opcodes(value: str) -> bytes:
+    data = value.encode()
+    return b"X" + struct.pack("<I", len(data)) + data
+
+
+def _global(memo: int, module: str, name: str) -> bytes:
+    """Return the opcodes that store a class or function in the memo."""
+    return f"c{module}\n{name}\n".encode() + bytes([ord("q"), memo, ord("0")])
+
+
+def _pickled_fields(data: Buffer, limits: Limits, wanted: Name) -> dict[str, Any]:
+    return fields_of(read_pickle(data, limits, _REQUESTS, NUMPY_CALLS), wanted)
+
+
+def _text(stated: Mapping[str, Any], name: str) -> str:
+    value = stated.get(name)
+    if not isinstance(value, str):
+        raise MalformedMessage(f"{name}: got {_shown(value)}, want text")
+    return value
+
+
+def _shown(value: object) -> str:
+    """Return a client's value for an error message: a number, or the type of anything else, whatever its size."""
+    return repr(value) if is_number(value) else type(value).__name__
+
+
+def _names(feature: Mapping[str, Any]) -> tuple[str, ...]:
+    names = feature.get("names")
+    if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
+        raise InvalidObservation(f"lerobot_features: {STATE!r}: want `names`, a list of texts")
+    return tuple(names)
+
+
+# The protobuf messages of LeRobot's `AsyncInference` service, read and written by hand.
+#
+# Source: `transport/services.proto` of LeRobot 0.4.4 and 0.6.1. `Observation` has the field 1, `transfer_state`, and
+# the field 2, `data`; `PolicySetup` and `Actions` have the field 1, `data`; `Empty` has none.
+
+SERVICE = "transport.AsyncInference"
+_VARINT, _FIXED64, _BYTES, _FIXED32 = 0, 1, 2, 5  # types of fields
+_VARINT_BYTES = 10  # largest length of a number
+
+
+class TransferState(enum.IntEnum):
+    """The position of a part in its message."""
+
+    BEGIN = 1
+    MIDDLE = 2
+    END = 3
+
+
+def read_observation_part(message: bytes) -> tuple[TransferState, memoryview]:
+    """Return the content of an `Observation`, a part of a pickle; raise `MalformedMessage` for anything else."""
+    number, data = 0, memoryview(b"")
+    for field, value in _protobuf_fields(message):
+        if field == 1 and isinstance(value, int):
+            number = value
+        elif field == 2 and isinstance(value, memoryview):
+            data = value
+    try:
+        return TransferState(number), data
+    except ValueError as error:
+        raise MalformedMessage(f"observation: got transfer state {number}, want 1, 2 or 3") from error
+
+
+def read_data(message: bytes) -> memoryview | None:
+    """Return the pickle in a `PolicySetup` or an `Actions`; None if it has none."""
+    fields = _protobuf_fields(message)
+    return next((value for field, value in fields if field == 1 and isinstance(value, memoryview)), None)
+
+
+def write_data(data: bytes) -> bytes:
+    """Return a `PolicySetup` or an `Actions` with a pickle."""
+    size, length = bytearray(), len(data)
+    while length > 0x7F:
+        size.append(length & 0x7F | 0x80)
+        length >>= 7
+    return bytes([1 << 3 | _BYTES, *size, length]) + data
+
+
+EMPTY = b""  # an `Empty`, and an `Actions` without a pickle
+
+
+def _protobuf_fields(message: bytes) -> Iterator[tuple[int, int | memoryview]]:
+    """Yield the number and the value of each field that is a number or bytes; other fields are skipped."""
+    view, at = memoryview(message), 0
+    while at < len(view):
+        key, at = _varint(view, at)
+        kind = key & 7
+        if kind == _VARINT:
+            value, at = _varint(view, at)
+            yield key >> 3, value
+            continue
+        length = {_FIXED64: 8, _FIXED32: 4}.get(kind)
+        if kind == _BYTES:
+            length, at = _varint(view, at)
+        if length is None or at + length > len(view):
+            raise MalformedMessage("protobuf: a field of an unknown type, or that ends too early")
+        if kind == _BYTES:
+            yield key >> 3, view[at : at + length]
+        at += length
+
+
+def _varint(view: memoryview, at: int) -> tuple[int, int]:
+    """Return the number at `at`, and the place after it."""
+    number = 0
+    for place, byte in enumerate(view[at : at + _VARINT_BYTES]):
+        number |= (byte & 0x7F) << (7 * place)
+        if byte < 0x80:
+            return number, at + place + 1
+    raise MalformedMessage("protobuf: a number that ends too early")
+
+
+# The mapping of LeRobot's robots: the names of its datasets, to which its own server converts a robot's names.
+
+STATE, IMAGES, TASK = "observation.state", "observation.images.", "task"
+
+PRESETS: dict[str, dict[str, Any]] = {
+    "lerobot": {
+        "cameras": {"*": f"{IMAGES}*"},
+        "state": {"joints": {"key": STATE, "optional": True}},
+        "instruction": TASK,
+    }
+}

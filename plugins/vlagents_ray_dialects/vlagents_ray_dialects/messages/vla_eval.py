@@ -1,0 +1,124 @@
+"""vla-eval's messages: msgpack maps of type, payload, seq and timestamp, protocol version 1.
+
+Arrays are maps with the key "__ndarray__"; images are maps with the key "__image__", raw, PNG or JPEG. The format
+is that of `vla_eval.protocol`, 0.8.0.
+"""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass
+from typing import Any, Literal, get_args
+
+import numpy as np
+
+from vlagents_ray.errors import MalformedMessage, MessageTooLarge, shown
+from vlagents_ray.images.codecs import decode_files
+from vlagents_ray.protocol.frame_layout import read_array
+from vlagents_ray.protocol.messages import DEFAULT_LIMITS, Budget, Limits
+from vlagents_ray_dialects.messages.msgpack import pack, unpack
+
+PROTOCOL_VERSION = 1
+Kind = Literal["hello", "observation", "action", "episode_start", "episode_end", "error"]
+
+
+@dataclass(slots=True)
+class Message:
+    """One message, in either direction; a reply has the sequence number of its request."""
+
+    kind: Kind
+    payload: dict[str, Any]
+    seq: int = 0
+
+
+class _File(bytes):
+    """A JPEG or PNG image that is not decoded yet."""
+
+
+def decode(data: bytes, limits: Limits = DEFAULT_LIMITS) -> Message:
+    """Return the message in `data`, with its JPEG and PNG images still encoded, see `decode_images`."""
+    taken = 0
+
+    def array(node: dict[Any, Any]) -> Any:
+        nonlocal taken
+        if "__image__" in node:
+            taken += 1
+            if taken > limits.cameras:
+                raise MessageTooLarge(f"message: more than {limits.cameras} images")
+            return _image(node)
+        if "__ndarray__" in node:
+            return read_array(node.get("data"), node.get("dtype"), node.get("shape"))  # type: ignore[arg-type]
+        return node
+
+    raw = unpack(data, limits, array)
+    if not isinstance(raw, dict) or not raw.keys() >= {"type", "payload", "seq"}:
+        raise MalformedMessage("message: want a map with type, payload and seq")
+    kind, payload, seq = raw["type"], raw["payload"], raw["seq"]
+    if not isinstance(kind, str) or kind not in get_args(Kind):
+        raise MalformedMessage(f"type: got {shown(kind)}, want one of {list(get_args(Kind))}")
+    if not isinstance(payload, dict):
+        raise MalformedMessage(f"payload: got {type(payload).__name__}, want a map")
+    if type(seq) is not int or not 0 <= seq < 2**63:
+        raise MalformedMessage(f"seq: got {shown(seq)}, want a whole number")
+    return Message(kind, payload, seq)  # type: ignore[arg-type]  # the kind was checked above
+
+
+def decode_images(payload: dict[str, Any], budget: Budget) -> dict[str, Any]:
+    """Return an observation with its images decoded; raise the errors of `budget` and of invalid images."""
+    files: dict[int, _File] = {}
+    names: dict[int, str] = {}
+
+    def find(node: Any, path: str) -> None:
+        if isinstance(node, _File):
+            files[id(node)] = node
+            names.setdefault(id(node), path)
+        elif isinstance(node, (dict, list)):
+            for key, item in node.items() if isinstance(node, dict) else enumerate(node):
+                find(item, f"{path}/{key}" if path else str(key))
+
+    find(payload, "")
+    images = dict(zip(files, decode_files(list(files.values()), budget, list(names.values())), strict=True))
+
+    def filled(node: Any) -> Any:
+        if isinstance(node, _File):
+            return images[id(node)]
+        if isinstance(node, dict):
+            return {key: filled(item) for key, item in node.items()}
+        return [filled(item) for item in node] if isinstance(node, list) else node
+
+    return {key: filled(item) for key, item in payload.items()}
+
+
+def encode(message: Message) -> bytes:
+    fields = {"type": message.kind, "payload": message.payload, "seq": message.seq, "timestamp": time.time()}
+    return pack(fields, _node)
+
+
+def _image(node: dict[Any, Any]) -> np.ndarray | _File:
+    data, form = node.get("data"), node.get("format")
+    if form == "raw":
+        return read_array(data, node.get("dtype"), node.get("shape"))  # type: ignore[arg-type]  # it checks
+    if form not in ("png", "jpeg") or not isinstance(data, bytes):
+        raise MalformedMessage(f"image: got format {shown(form, 20)}, want raw, png or jpeg, and bytes")
+    return _File(data)
+
+
+def _node(value: Any) -> Any:
+    if isinstance(value, np.ndarray) and value.dtype.kind in "biuf":
+        return {"__ndarray__": True, "data": value.tobytes(), "dtype": value.dtype.str, "shape": list(value.shape)}
+    if isinstance(value, np.generic) and value.dtype.kind in "biuf":
+        return value.item()
+    raise TypeError(f"cannot send {type(value).__name__}; want plain values and arrays of numbers")
+
+
+# The mapping of vla-eval's benchmarks.
+
+PRESETS: dict[str, dict[str, Any]] = {
+    # The benchmark chooses the names of cameras. Most benchmarks call the state `states`, some `state`, as recommended
+    # in vla-eval's types.py; its own servers prefer the former. RoboTwin's is `joint_state`.
+    "vla-eval": {
+        "cameras": {"*": "images/*"},
+        "state": {"state": {"key": "states|state|joint_state", "optional": True}},
+        "instruction": "task_description",
+    }
+}

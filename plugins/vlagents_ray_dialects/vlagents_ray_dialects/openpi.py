@@ -1,0 +1,302 @@
+"""openpi's and RoboArena's clients over WebSocket: requests and replies are binary maps; the server sends first.
+
+RoboArena's clients use nearly the same protocol and also connect to the root. Both dialects may be on: RoboArena's
+requests name an `endpoint`, openpi's do not. The first message is then RoboArena's configuration, which openpi's client
+takes for metadata.
+
+An error is a text with a request id, after which the connection is closed (1011) except for 429; openpi's own server
+sends a traceback.
+
+A batch, `{"batch": [observation, ...]}`, is that of openpi's pull request 941 (its head 5bdadc8), which was open when
+this was written: the reply is one map, whose `actions` are stacked. openpi's own client sends nothing when it is reset;
+the message `{"reset": True}` is that of its derivatives.
+"""
+
+from __future__ import annotations
+
+import abc
+import time
+import uuid
+from collections.abc import Mapping, Sequence
+from functools import partial
+from typing import Any, ClassVar, Literal
+
+import numpy as np
+from pydantic import Field
+from starlette.websockets import WebSocket, WebSocketDisconnect
+
+from vlagents_ray.errors import MalformedMessage, PolicyUnavailable, TooManyRequests, VLAgentsError, shown
+from vlagents_ray.protocol.messages import NAME_CHARACTERS, Reply
+from vlagents_ray.serve.config.dialects import DialectConfig, MappingSetting
+from vlagents_ray.serve.dialects import base
+from vlagents_ray.serve.endpoints.http_messages import public_problem
+from vlagents_ray.serve.engine.admission import MessageAdmission
+from vlagents_ray.serve.engine.sender import REFUSED, Sender
+from vlagents_ray.serve.requests import Message
+from vlagents_ray_dialects.messages import openpi
+
+
+class MapDialect(base.RouteDialect):
+    """A dialect whose messages are maps in openpi's encoding; all such dialects share the server's root."""
+
+    root = "openpi"
+
+    async def stream(self, socket: WebSocket) -> None:
+        """Serve one connection at this dialect's path."""
+        await _stream([self], socket)
+
+    def at_root(self, sharing: Sequence[MapDialect]) -> base.Stream:
+        return partial(_stream, sharing)
+
+    @abc.abstractmethod
+    def first(self) -> dict[str, Any]:
+        """Return the message that a client gets when it connects."""
+
+    @abc.abstractmethod
+    def speaks(self, message: dict[str, Any]) -> bool:
+        """Return whether a message is from a client of this dialect."""
+
+    def begins(self, message: dict[str, Any], connection: MapConnection) -> bytes | str | None:
+        """Begin an episode if the message requires it.
+
+        Returns:
+            The reply if the message is not an observation; empty if the client expects no reply.
+        """
+        return None
+
+    def batch(self, message: dict[str, Any]) -> list[Any] | None:
+        """Return the observations of a message that is a batch; None if it is one observation."""
+        return None
+
+    def answer(self, replies: Sequence[Reply], before_ms: float | None, *, batched: bool) -> Any:
+        """Encode the replies in the client's format; `before_ms` is the server's time for the previous message."""
+        inference_ms = max(reply.timing["inference_ms"] for reply in replies)
+        infer_ms = max(reply.timing["queue_ms"] + reply.timing["inference_ms"] for reply in replies)
+        rows = [self.rows(reply) for reply in replies]
+        actions = _stacked(rows) if batched else rows[0]
+        return (self.mapping.columns(actions) or {"actions": actions}) | {
+            "policy_timing": {"infer_ms": inference_ms} | ({"batch_size": len(rows)} if batched else {}),
+            "server_timing": {"infer_ms": infer_ms} | ({} if before_ms is None else {"prev_total_ms": before_ms}),
+        }
+
+
+def _stacked(chunks: Sequence[np.ndarray]) -> np.ndarray:
+    """Stack the chunks of a batch to (B, H, D)."""
+    if len(shapes := {chunk.shape for chunk in chunks}) > 1:
+        raise VLAgentsError(
+            f"batch: got chunks of the shapes {sorted(shapes)}, and its reply is one array; send each by itself"
+        )
+    return np.stack(chunks)
+
+
+class OpenPiDialectConfig(DialectConfig):
+    """The settings of `openpi-client`, over WebSocket."""
+
+    mapping: MappingSetting  # each of openpi's robots has different keys, so there is no default
+    metadata: dict[str, Any] = Field(
+        default_factory=dict, description="added to what the client is sent first, such as reset_pose"
+    )
+    answer_reset: bool = Field(
+        default=False, description='whether {"reset": True} is answered, by the same; clients differ in waiting for it'
+    )
+
+
+class OpenPiDialect(MapDialect):
+    """openpi's protocol: a session begins with the connection, and an episode with each new prompt.
+
+    The observations of a batch are those of further sessions, in order. A batch of another size ends all their
+    episodes, as the owner of each observation is unknown.
+    """
+
+    Config = OpenPiDialectConfig
+    clients = "openpi"
+    summary = (
+        "A session is the connection, or a place in its batches; an episode begins with each new prompt. An error is a "
+        "text, then close 1011."
+    )
+    paths: ClassVar[Mapping[str, str]] = {"WS /openpi": "stream"}
+    presets = openpi.PRESETS
+    config: OpenPiDialectConfig
+
+    def first(self) -> dict[str, Any]:
+        known = self.context.metadata()
+        return {key: known.get(key) for key in ("policy", "checkpoint", "version")} | self.config.metadata
+
+    def speaks(self, message: dict[str, Any]) -> bool:
+        return "endpoint" not in message
+
+    def begins(self, message: dict[str, Any], connection: MapConnection) -> bytes | str | None:
+        if message.keys() != {"reset"}:
+            return None
+        if message["reset"] is not True:
+            raise MalformedMessage(f"reset: got {shown(message['reset'])}, want true")
+        connection.end_episodes()
+        return openpi.encode(message) if self.config.answer_reset else b""
+
+    def batch(self, message: dict[str, Any]) -> list[Any] | None:
+        if message.keys() != {"batch"}:
+            return None
+        batch = message["batch"]
+        if not isinstance(batch, list) or not batch:
+            raise MalformedMessage(f"batch: got {shown(batch)}, want a list of one observation or more")
+        return batch
+
+
+class RoboArenaDialectConfig(DialectConfig):
+    """The settings of RoboArena's client; except for `bare`, the fields are those of its PolicyServerConfig."""
+
+    mapping: MappingSetting = "roboarena"
+    image_resolution: tuple[int, int] | None = Field(default=(224, 224), description="height, width; null: any")
+    needs_wrist_camera: bool = True
+    n_external_cameras: int = Field(default=1, ge=0, le=2)
+    needs_stereo_camera: bool = False
+    needs_session_id: bool = False
+    action_space: Literal["joint_position", "joint_velocity", "cartesian_position", "cartesian_velocity"] = (
+        "joint_position"
+    )
+    bare: bool = Field(default=False, description="answer the array itself, as older clients want it")
+
+
+class RoboArenaDialect(MapDialect):
+    """RoboArena's protocol: an episode ends with `reset`, or with another `session_id`."""
+
+    Config = RoboArenaDialectConfig
+    clients = "RoboArena"
+    summary = (
+        "A session is the connection; `reset` or a new `session_id` begins an episode. An error is a text, "
+        "then close 1011."
+    )
+    paths: ClassVar[Mapping[str, str]] = {"WS /roboarena": "stream"}
+    presets = openpi.ROBOARENA
+    config: RoboArenaDialectConfig
+
+    def first(self) -> dict[str, Any]:
+        return self.config.model_dump(mode="json", exclude={"mapping", "rank", "bare"})
+
+    def speaks(self, message: dict[str, Any]) -> bool:
+        return "endpoint" in message
+
+    def begins(self, message: dict[str, Any], connection: MapConnection) -> bytes | str | None:
+        endpoint = message.get("endpoint", "infer")
+        if not isinstance(endpoint, str) or endpoint not in ("infer", "reset"):
+            raise MalformedMessage(f"endpoint: got {shown(endpoint)}, want 'infer' or 'reset'")
+        if endpoint == "reset":
+            connection.end_episodes()
+            return "reset successful"
+        if (named := message.get("session_id")) is not None:
+            if isinstance(named, np.ndarray) and named.size == 1:  # the client sends a text, or an array with one text
+                named = named.item()
+            episode = shown(named, NAME_CHARACTERS)
+            if connection.episode not in (None, episode):
+                connection.end_episodes()
+            connection.episode = episode
+        return None
+
+    def answer(self, replies: Sequence[Reply], before_ms: float | None, *, batched: bool) -> Any:
+        return self.rows(replies[0]) if self.config.bare else super().answer(replies, before_ms, batched=batched)
+
+
+class MapConnection:
+    """The state of one dialect on a connection, with its session."""
+
+    def __init__(self, dialect: MapDialect) -> None:
+        self.dialect = dialect
+        self.sender: Sender = dialect.sender()
+        self.session: base.ImplicitSession = dialect.session(self.sender)
+        self.episode: str | None = None  # name of the episode, set by the client
+        self._batched: list[base.ImplicitSession] = []  # sessions by index in a batch
+        self._before_ms: float | None = None
+
+    def end_episodes(self) -> None:
+        """Make the next observation of each session begin an episode."""
+        for session in (self.session, *self._batched):
+            session.episode.end()
+
+    async def answer(self, message: dict[str, Any], incoming: Message, request_id: str, gate: Sender) -> bytes | str:
+        """Return the reply to one message; `gate` counts the observations of a batch after the first for the key."""
+        dialect = self.dialect
+        if (answer := dialect.begins(message, self)) is not None:
+            return answer
+        batch = dialect.batch(message)
+        observations = [message] if batch is None else batch
+        gate.count(len(observations) - 1)
+        read = [dialect.read(one) for one in observations]
+        sessions = [self.session] if batch is None else await self._of_batch(len(batch))
+        if not sessions[0].episode.begun:
+            dialect.mapping.warn_of_unread_cameras(observations[0], dialect.name)
+        seen = [base.SessionObs(session, *one) for session, one in zip(sessions, read, strict=True)]
+        incoming.decoded_alike(len(observations))
+        replies = await base.act_together(incoming, seen, request_id)
+        before_ms, batched = self._before_ms, batch is not None
+        data = incoming.written(lambda: openpi.encode(dialect.answer(replies, before_ms, batched=batched)))
+        self._before_ms = (time.perf_counter() - incoming.arrived) * 1e3
+        return data
+
+    async def _of_batch(self, number: int) -> list[base.ImplicitSession]:
+        """Return the sessions of a batch of that size, in order; a change of the size ends the episodes."""
+        if number != len(self._batched):
+            surplus, self._batched = self._batched[number:], self._batched[:number]
+            for session in surplus:
+                await session.close()
+            for session in self._batched:
+                session.episode.end()
+            while len(self._batched) < number:
+                self._batched.append(self.dialect.session(self.sender, uuid.uuid4().hex))
+        return self._batched
+
+
+async def _stream(dialects: Sequence[MapDialect], socket: WebSocket) -> None:
+    """Serve one connection at a path of these dialects, of which the last one sends the first message."""
+    if not await base.accept_or_refuse(socket, dialects[0].context):
+        return
+    connections: dict[str, MapConnection] = {}
+    gate = dialects[0].gate()
+    try:
+        await socket.send_bytes(openpi.encode(dialects[-1].first()))
+        while (received := await dialects[0].receive(socket, gate)) is not None:
+            if not await _answer(dialects, socket, *received, connections, gate):
+                return
+    except WebSocketDisconnect:
+        return
+    finally:
+        for connection in connections.values():
+            connection.sender.release(for_good=True)
+
+
+async def _answer(
+    dialects: Sequence[MapDialect],
+    socket: WebSocket,
+    data: bytes | None,
+    admission: MessageAdmission,
+    connections: dict[str, MapConnection],
+    gate: Sender,
+) -> bool:
+    """Reply to one message; return False if the connection was closed."""
+    incoming, request_id = dialects[0].arrived(), uuid.uuid4().hex
+    try:
+        message = await base.decoded(lambda data, budget: openpi.decode(data, budget.limits), data, admission)
+        dialect = next((dialect for dialect in dialects if dialect.speaks(message)), dialects[0])
+        arrived, incoming = incoming.arrived, dialect.arrived()
+        incoming.arrived = arrived
+        connection = connections.get(dialect.name) or connections.setdefault(dialect.name, MapConnection(dialect))
+        answer = await connection.answer(message, incoming, request_id, gate)
+    except Exception as error:  # noqa: BLE001 - the error is the reply to the client
+        problem = public_problem(error, incoming.transport, request_id)
+        incoming.record_failure(problem.code)
+        await socket.send_text(f"{problem} (request {request_id})")
+        if isinstance(problem, TooManyRequests):  # the connection stays open, as nothing was acted on
+            if gate.refused_too_often:
+                await socket.close(base.POLICY_VIOLATION, REFUSED)
+            return not gate.refused_too_often
+        if isinstance(problem, PolicyUnavailable):
+            await socket.close(base.SERVICE_RESTART, str(problem)[:120])
+        else:
+            await socket.close(base.INTERNAL_ERROR, "Internal server error.")
+        return False
+    finally:
+        admission.release()
+    if isinstance(answer, str):
+        await socket.send_text(answer)
+    elif answer:
+        await socket.send_bytes(answer)
+    return True

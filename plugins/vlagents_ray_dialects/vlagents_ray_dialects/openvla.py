@@ -1,0 +1,66 @@
+"""OpenVLA's REST protocol: `POST /act` with an observation, to which the reply is an action.
+
+Errors have their own status here, while OpenVLA's own server replies with 200 and "error".
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any, ClassVar
+
+import numpy as np
+from pydantic import Field
+from starlette.requests import Request as HttpRequest
+from starlette.responses import Response
+
+from vlagents_ray.errors import InvalidObservation
+from vlagents_ray.interface import Obs
+from vlagents_ray.protocol.messages import Budget
+from vlagents_ray.serve.config.dialects import DialectConfig, MappingSetting
+from vlagents_ray.serve.dialects.base import HttpDialect
+from vlagents_ray_dialects.messages import openvla
+from vlagents_ray_dialects.messages.openvla import PRESETS
+
+
+class OpenVLADialectConfig(DialectConfig):
+    """The settings of the REST clients of OpenVLA, and of its forks that post whole observations."""
+
+    mapping: MappingSetting = "openvla"
+    chunk: bool = Field(default=False, description="answer all rows, as OFT's clients want it, not the first alone")
+    plain: bool = Field(default=False, description="answer lists of numbers, as GO-1's clients read them, not arrays")
+
+
+class OpenVLADialect(HttpDialect):
+    """OpenVLA's protocol, which has no sessions unless the client names one."""
+
+    Config = OpenVLADialectConfig
+    clients = "OpenVLA"
+    summary = "An episode is one request, unless that names a session. An error has its status and problem+json."
+    paths: ClassVar[Mapping[str, str]] = {"POST /act": "act"}
+    presets = PRESETS
+    config: OpenVLADialectConfig
+
+    def read(self, theirs: Any) -> tuple[Obs, str | None]:
+        """Convert a client's observation, which needs an instruction if the mapping has a key for it."""
+        obs, instruction = super().read(theirs)
+        if instruction is None and self.mapping.instruction is not None:
+            raise InvalidObservation("instruction: got none, the policy needs one; send it with the observation")
+        return obs, instruction
+
+    async def act(self, http: HttpRequest) -> Response:
+        """Answer one request; the reply is encoded once or twice, like the request."""
+        twice = False
+
+        def read(data: bytes, budget: Budget) -> dict[str, Any]:
+            nonlocal twice
+            theirs, twice = openvla.decode(data, budget.limits)
+            return theirs
+
+        def write(rows: np.ndarray) -> bytes:
+            chosen = rows if self.config.chunk else rows[0]
+            if self.config.plain:
+                return openvla.encode(chosen.tolist(), twice)
+            named = self.mapping.columns(chosen)
+            return openvla.encode(named or (list(rows) if self.config.chunk else chosen), twice)
+
+        return await self.answer(http, read, write)

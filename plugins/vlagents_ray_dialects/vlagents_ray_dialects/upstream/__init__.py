@@ -1,0 +1,5 @@
+"""Other policy servers' models behind our queue, sessions, keys, evaluation and live view."""
+
+from vlagents_ray_dialects.upstream.policy import Upstream
+
+__all__ = ["Upstream"]

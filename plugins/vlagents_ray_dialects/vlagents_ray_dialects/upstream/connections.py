@@ -1,0 +1,294 @@
+"""Connections to upstreams: shared by all sessions, or one for each session if the upstream keeps sessions."""
+
+from __future__ import annotations
+
+import logging
+import threading
+import time
+from collections import Counter, deque
+from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from typing import Any
+
+from vlagents_ray.errors import (
+    ConnectionLost,
+    NoReplica,
+    PolicyFailed,
+    PolicyUnavailable,
+    UnknownSession,
+    VLAgentsError,
+)
+from vlagents_ray_dialects.upstream.client import Answer, UpstreamClient
+
+logger = logging.getLogger(__name__)
+
+_CONNECT_S = 5.0  # s for one attempt to connect
+_FIRST_PAUSE_S, _LONGEST_PAUSE_S = 0.02, 1.0
+_ATTEMPTS = 3  # connections that one row may lose, so that a row that crashes an upstream does not end them all
+
+Check = Callable[[UpstreamClient, Mapping[str, Any]], None]
+
+
+@dataclass(slots=True)
+class _Share:
+    """Rows of a batch that are sent together."""
+
+    rows: range
+    attempts: int = 0
+
+
+class Lanes:
+    """The shared connections; a lost one is reopened in the background while the others continue.
+
+    Args:
+        clients: The clients, not connected yet.
+        check: Raises an error if the metadata shows that an upstream is the wrong one.
+        retry_s: How long a batch waits for a lost upstream if there is no other, s.
+    """
+
+    def __init__(self, clients: Sequence[UpstreamClient], check: Check, retry_s: float) -> None:
+        self._clients, self._check, self._retry_s = clients, check, retry_s
+        self._ready: list[UpstreamClient] = []
+        self._changed = threading.Condition()
+        self._reason: VLAgentsError = NoReplica("upstream: not connected yet")  # why the last attempt failed
+        self._connecting: list[threading.Thread] = []
+        self._closed = False
+        self._pool = ThreadPoolExecutor(max(1, len(clients) - 1), "upstream")
+
+    def start(self, timeout_s: float) -> None:
+        """Wait until one upstream answers; raises `ContractMismatch` if it is the wrong one."""
+        for client in self._clients:
+            self._connect_in_background(client)
+        with self._changed:
+            # Waiting may help if the upstream is unavailable, but not if it is the wrong one.
+            self._changed.wait_for(lambda: self._ready or self._reason.status != NoReplica.status, timeout_s)
+            failed = None if self._ready else self._reason
+        if failed is not None:
+            self.close()
+            raise failed
+
+    def ask(self, observations: Sequence[Mapping[str, Any]]) -> list[Answer | Exception]:
+        """Return the answer to each observation, or the error in its place.
+
+        If a connection is lost, its rows are sent again over another one, or over the same one once it is reopened: an
+        upstream without sessions keeps no state of them.
+        """
+        results: list[Answer | Exception] = [NoReplica("upstream: not asked")] * len(observations)
+        deadline = time.monotonic() + self._retry_s
+        work: deque[_Share] = deque()
+        while not work or time.monotonic() < deadline:
+            with self._changed:
+                self._changed.wait_for(lambda: self._ready or self._closed, max(0.0, deadline - time.monotonic()))
+                ready = list(self._ready)
+            if not work:  # single rows, or as many parts as there are connections if the protocol has batches
+                rows = len(observations)
+                parts = min(rows, max(1, len(ready))) if self._clients[0].batches else rows
+                work.extend(_Share(range(rows * i // parts, rows * (i + 1) // parts)) for i in range(parts))
+            if not ready:
+                break
+            others = [
+                self._pool.submit(self._work, client, work, observations, results) for client in ready[1 : len(work)]
+            ]
+            self._work(ready[0], work, observations, results)
+            for other in others:
+                other.result()
+            if not work:
+                return results
+        for share in work:
+            for row in share.rows:
+                results[row] = NoReplica(f"{self._reason}; no other upstream answers either: send the request again")
+        return results
+
+    def close(self) -> None:
+        with self._changed:
+            self._closed = True
+            self._changed.notify_all()
+            ready, self._ready = self._ready, []
+        self._pool.shutdown()
+        for client in ready:  # a client that is connecting is closed by the thread that connects it
+            client.close()
+        for thread in self._connecting:
+            thread.join(2 * _CONNECT_S)
+
+    def _work(
+        self,
+        client: UpstreamClient,
+        work: deque[_Share],
+        observations: Sequence[Mapping[str, Any]],
+        results: list[Answer | Exception],
+    ) -> None:
+        """Send shares over one connection until none is left or it is lost; an ended connection consumes no share."""
+        while True:
+            if not client.is_open:
+                self._lose(client, None)
+                return
+            try:
+                share = work.popleft()
+            except IndexError:
+                return
+            try:
+                answers: Sequence[Answer | Exception] = client.ask([observations[row] for row in share.rows])
+            except ConnectionLost as error:
+                share.attempts += 1
+                if share.attempts < _ATTEMPTS:
+                    work.append(share)
+                for row in share.rows:
+                    results[row] = error
+                self._lose(client, error)
+                return
+            except Exception as error:  # noqa: BLE001 - the result of these rows alone
+                answers = [error] * len(share.rows)
+                if len(share.rows) > 1:  # one of the rows may be the cause, and must not fail the others
+                    work.extend(_Share(range(row, row + 1), share.attempts) for row in share.rows)
+            for row, answer in zip(share.rows, answers, strict=True):
+                results[row] = answer
+
+    def _lose(self, client: UpstreamClient, reason: VLAgentsError | None) -> None:
+        client.close()
+        with self._changed:
+            if reason is not None:
+                self._reason = reason
+            if client not in self._ready:
+                return
+            self._ready.remove(client)
+        if reason is not None:
+            logger.warning("%s; connecting again", reason)
+        self._connect_in_background(client)
+
+    def _connect_in_background(self, client: UpstreamClient) -> None:
+        thread = threading.Thread(target=self._connect, args=(client,), name="upstream-connect", daemon=True)
+        self._connecting = [one for one in self._connecting if one.is_alive()] + [thread]
+        thread.start()
+
+    def _connect(self, client: UpstreamClient) -> None:
+        pause_s, logged = _FIRST_PAUSE_S, ""
+        while not self._closed:
+            try:
+                self._check(client, client.connect(_CONNECT_S))
+            except Exception as error:
+                if isinstance(error, VLAgentsError):
+                    reason = error
+                else:
+                    logger.exception("upstream %s: connecting failed", client.options.url)
+                    reason = PolicyFailed(
+                        f"upstream {client.options.url}: connecting failed, the server's log says how"
+                    )
+                client.close()
+            else:
+                break
+            with self._changed:
+                if str(reason) != logged:
+                    logger.warning("%s", logged := str(reason))
+                self._reason = reason
+                self._changed.notify_all()
+                self._changed.wait_for(lambda: self._closed, pause_s)
+            pause_s = min(_LONGEST_PAUSE_S, 2 * pause_s)
+        with self._changed:
+            if self._closed:
+                client.close()
+                return
+            self._ready.append(client)
+            self._changed.notify_all()
+        logger.info("upstream %s answers", client.options.url)
+
+
+# Connections to upstreams that keep sessions: one for each session's episode.
+
+_AT_ONCE = 32  # largest number of sessions of a batch that are sent at the same time
+
+
+class SessionConnections:
+    """The connection of each session, to the upstream with the fewest sessions.
+
+    Args:
+        urls: The addresses of the upstreams.
+        make: Returns a client of an address.
+        check: Raises an error if the metadata shows that an upstream is the wrong one.
+        retry_s: How long the start of an episode waits for an upstream, s.
+    """
+
+    def __init__(
+        self, urls: Sequence[str], make: Callable[[str], UpstreamClient], check: Check, retry_s: float
+    ) -> None:
+        self._urls, self._make, self._check, self._retry_s = urls, make, check, retry_s
+        self._clients: dict[str, UpstreamClient] = {}
+        self._lock = threading.Lock()
+        self._pool = ThreadPoolExecutor(_AT_ONCE, "upstream")
+
+    def start(self, timeout_s: float) -> None:
+        """Return when one upstream answers and its metadata fits the mapping; raises the errors of `Lanes.start`."""
+        self._connected(timeout_s).close()
+
+    def begin(self, session: str) -> None:
+        """Connect for an episode of a session; raises `NoReplica` if no upstream answers within `retry_s`."""
+        client = self._connected(self._retry_s)
+        try:
+            client.begin()
+        except BaseException:
+            client.close()
+            raise
+        with self._lock:
+            self._clients[session] = client
+
+    def ask(self, sessions: Sequence[str], observations: Sequence[Mapping[str, Any]]) -> list[Answer | Exception]:
+        """Return the answer to the observation of each session, or the error in its place."""
+        others = [
+            self._pool.submit(self._ask, session, observation)
+            for session, observation in zip(sessions[1:], observations[1:], strict=True)
+        ]
+        first = self._ask(sessions[0], observations[0]) if sessions else None
+        return [] if first is None else [first, *(other.result() for other in others)]
+
+    def drop(self, session: str) -> None:
+        with self._lock:
+            client = self._clients.pop(session, None)
+        if client is not None:
+            threading.Thread(target=client.close, name="upstream-close", daemon=True).start()  # it may wait for a reply
+
+    def close(self) -> None:
+        self._pool.shutdown()
+        with self._lock:
+            clients, self._clients = self._clients, {}
+        for client in clients.values():
+            client.close()
+
+    def _ask(self, session: str, observation: Mapping[str, Any]) -> Answer | Exception:
+        with self._lock:
+            client = self._clients.get(session)
+        if client is None:
+            return UnknownSession("upstream: the session's connection is lost; reset it")
+        try:
+            [answer] = client.ask([observation])
+        except ConnectionLost as error:
+            logger.warning("%s; its session begins again", error)
+            self.drop(session)
+            return UnknownSession(f"{error}, and with it the upstream's session; reset it")
+        except Exception as error:  # noqa: BLE001 - the result of this row alone
+            if not client.is_open:
+                self.drop(session)
+            return error
+        return answer
+
+    def _connected(self, timeout_s: float) -> UpstreamClient:
+        """Return a client connected to the upstream with the fewest sessions among those that answer."""
+        deadline, pause_s = time.monotonic() + timeout_s, _FIRST_PAUSE_S
+        while True:
+            with self._lock:
+                load = Counter(client.options.url for client in self._clients.values())
+            for url in sorted(self._urls, key=lambda url: load[url]):
+                client = self._make(url)
+                try:
+                    self._check(client, client.connect(_CONNECT_S))
+                except PolicyUnavailable as error:
+                    client.close()
+                    reason = error
+                except BaseException:
+                    client.close()
+                    raise
+                else:
+                    return client
+            if time.monotonic() + pause_s > deadline:
+                raise NoReplica(f"{reason}; no other upstream answers either") from reason
+            time.sleep(pause_s)
+            pause_s = min(_LONGEST_PAUSE_S, 2 * pause_s)

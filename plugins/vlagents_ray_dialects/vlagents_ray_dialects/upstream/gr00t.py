@@ -1,0 +1,149 @@
+"""A client of GR00T's `PolicyServer`: one batch per message over ZeroMQ."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Mapping, Sequence
+from typing import Any, ClassVar
+
+from vlagents_ray.errors import InvalidObservation, VLAgentsError
+from vlagents_ray.registry import require
+from vlagents_ray.wire.mapping import matches
+from vlagents_ray_dialects.messages import gr00t as wire
+from vlagents_ray_dialects.messages.gr00t import TEXT_KEY, is_flat, nested
+from vlagents_ray_dialects.messages.outgoing import Outgoing
+from vlagents_ray_dialects.upstream.client import Answer, ClientOptions, UpstreamClient
+
+
+class GR00TClient(UpstreamClient):
+    """A client of servers from N1.6 on, or of N1.5, recognised by modality keys such as `video.front`.
+
+    If the mapping has such keys, the observation has them also, as `Gr00tSimPolicyWrapper` expects.
+    """
+
+    batches: ClassVar[bool] = True
+    mapping: ClassVar[str | None] = "gr00t"
+    schemes: ClassVar[tuple[str, ...]] = ("tcp",)
+
+    def __init__(self, options: ClientOptions) -> None:
+        super().__init__(options)
+        self._zmq = require("zmq")
+        self._context: Any = None
+        self._socket: Any = None
+        self._monitor: Any = None
+        self._text_key = TEXT_KEY
+        self._flat = False
+        self._packed = False
+
+    @property
+    def is_open(self) -> bool:
+        return self._socket is not None and not self._monitor.poll(0)
+
+    def connect(self, timeout_s: float) -> dict[str, Any]:
+        zmq = self._zmq
+        self._context = zmq.Context(io_threads=1)
+        self._socket = self._context.socket(zmq.REQ)
+        self._socket.setsockopt(zmq.LINGER, 0)
+        self._socket.setsockopt(zmq.IMMEDIATE, 1)  # do not queue messages for an upstream that is not connected
+        self._socket.setsockopt(zmq.MAXMSGSIZE, self.options.limits.body_bytes)
+        self._monitor = self._socket.get_monitor_socket(zmq.EVENT_DISCONNECTED)
+        try:
+            self._socket.connect(self.options.url)
+            reply = self._call("get_modality_config", None, timeout_s)
+            self._flat, self._packed = _is_flat(reply), wire.reads_packed(reply)
+            modalities = wire.read_modalities(reply)
+        except (zmq.ZMQError, VLAgentsError) as error:
+            self.close()
+            raise self.unreachable(error) from error
+        if (language := modalities.get("language")) is not None and language["keys"]:
+            self._text_key = language["keys"][0]
+        return modalities
+
+    def ask(self, observations: Sequence[Mapping[str, Any]]) -> list[Answer]:
+        flat = is_flat(observations[0])
+        try:
+            batched = wire.batch([nested(one) for one in observations] if flat else observations, self._text_key)
+        except ValueError as error:
+            raise InvalidObservation(f"gr00t: {error}; all sessions of a deployment must send the same") from error
+        named = wire.flat(batched) if self._flat or flat else batched
+        data = named if self._flat else {"observation": named, "options": None}
+        reply = self._call("get_action", data, self.options.timeout_s)
+        return list(wire.read_actions(reply, len(observations)))
+
+    def begin(self) -> None:
+        self._call("reset", None if self._flat else {"options": None}, self.options.timeout_s)
+
+    def close(self) -> None:
+        if self._socket is not None:
+            self._socket.disable_monitor()
+            self._monitor.close(linger=0)
+            self._socket.close(linger=0)
+            self._socket = None
+        if self._context is not None:
+            self._context.term()
+            self._context = None
+
+    def differences(self, metadata: Mapping[str, Any], outgoing: Outgoing) -> list[str]:
+        found = []
+        mapping = outgoing.mapping
+        for kind, field, keys in (
+            ("video", "cameras", [camera.key for camera in mapping.cameras.values()]),
+            ("state", "state", [part.key for parts in mapping.state.values() for part in parts]),
+        ):
+            stated = metadata.get(kind, {"keys": [], "steps": []})
+            given = [one.removeprefix(f"{kind}/").removeprefix(f"{kind}.") for key in keys for one in key.split("|")]
+            if lacks := [key for key in stated["keys"] if not any(matches(key, one) for one in given)]:
+                found.append(
+                    f"{kind}: the upstream needs {lacks}, the mapping gives {given}; add them to mapping.{field}"
+                )
+            if len(stated["steps"]) > 1:
+                found.append(
+                    f"{kind}: the upstream needs the moments {stated['steps']}, and only the newest is sent; "
+                    f"serve a model that needs one"
+                )
+        names = metadata.get("action", {"keys": []})["keys"]
+        if names and (wrong := [name for name in mapping.action if name not in names]):
+            found.append(f"action: the upstream gives {names}, mapping.action reads {wrong}; change it")
+        if len(names) > 1 and not mapping.action:
+            found.append(f"action: the upstream gives {names}; say in mapping.action which columns of ours each is")
+        return found
+
+    def chunk(self, metadata: Mapping[str, Any]) -> int | None:
+        return len(metadata.get("action", {}).get("steps", ())) or None
+
+    def _call(self, endpoint: str, data: Any, timeout_s: float) -> Any:
+        if self._socket is None:
+            raise self.closed()
+        deadline = time.monotonic() + timeout_s
+        try:
+            self._wait(self._zmq.POLLOUT, deadline, "it takes no connection")
+            self._socket.send(wire.write(endpoint, data, self.options.key, packed=self._packed), self._zmq.NOBLOCK)
+            self._wait(self._zmq.POLLIN, deadline, "no answer")
+            payload = self._socket.recv(self._zmq.NOBLOCK)
+        except self._zmq.ZMQError as error:
+            raise self.lost(error) from error
+        reply = wire.read(payload, self.options.limits)
+        if isinstance(reply, dict) and "error" in reply:
+            raise self.failed(reply["error"])
+        return reply
+
+    def _wait(self, event: int, deadline: float, what: str) -> None:
+        """Wait until the socket can be written or read; raise `ConnectionLost` if its connection ends first."""
+        begun = time.monotonic()
+        poller = self._zmq.Poller()
+        poller.register(self._socket, event)
+        poller.register(self._monitor, self._zmq.POLLIN)
+        ready = dict(poller.poll(max(0.0, deadline - begun) * 1e3))
+        if self._socket in ready:
+            return
+        ended = self._monitor in ready
+        raise self.lost("the connection ended" if ended else f"{what} within {deadline - begun:.3g} s")
+
+
+def _is_flat(reply: Any) -> bool:
+    """Return whether modalities have N1.5's keys, which begin with the name of the modality."""
+    video = reply.get("video") if isinstance(reply, dict) else None
+    config = video.get("as_json", video) if isinstance(video, dict) else None
+    return isinstance(config, str) or (
+        isinstance(config, dict) and any(str(key).startswith("video.") for key in config.get("modality_keys", []))
+    )

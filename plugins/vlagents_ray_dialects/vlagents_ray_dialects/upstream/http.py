@@ -1,0 +1,197 @@
+"""Clients of the protocols over HTTP: OpenVLA's `vla-scripts/deploy.py`, SGLang's actions and FlashRT's server."""
+
+from __future__ import annotations
+
+import abc
+import base64
+import http.client
+import json
+import re
+import select
+import socket
+from collections.abc import Mapping, Sequence
+from typing import Any, ClassVar
+from urllib.parse import urlsplit
+
+import numpy as np
+
+from vlagents_ray.client.http_deadline import DeadlineSocket
+from vlagents_ray.errors import ConnectionLost, InvalidObservation, MessageTooLarge, PolicyUnavailable, VLAgentsError
+from vlagents_ray.wire import json_numpy
+from vlagents_ray_dialects.messages import openpi, openvla
+from vlagents_ray_dialects.messages.outgoing import Outgoing
+from vlagents_ray_dialects.upstream.client import Answer, ClientOptions, UpstreamClient
+
+_BUSY = (408, 429, 502, 503, 504)
+
+
+class HttpClient(UpstreamClient):
+    """A client that posts one observation per request, over a connection that stays open."""
+
+    schemes: ClassVar[tuple[str, ...]] = ("http", "https")
+    path: ClassVar[str]  # of a URL that has none
+    about: ClassVar[str | None] = None  # path of the upstream's metadata, a JSON object
+    media_type: ClassVar[str] = "application/json"
+
+    def __init__(self, options: ClientOptions) -> None:
+        super().__init__(options)
+        self._url = urlsplit(options.url)
+        self._path = self._url.path.rstrip("/") or self.path
+        self._headers = {"Content-Type": self.media_type, "Accept": self.media_type}
+        if options.key is not None:
+            self._headers["Authorization"] = f"Bearer {options.key}"
+        self._connection: tuple[http.client.HTTPConnection, DeadlineSocket] | None = None
+
+    @abc.abstractmethod
+    def encode(self, observation: Mapping[str, Any]) -> bytes:
+        """Return the body of the request with an observation."""
+
+    @abc.abstractmethod
+    def decode(self, body: bytes) -> np.ndarray:
+        """Return the actions in the body of an answer, (D,) or (H, D)."""
+
+    @property
+    def is_open(self) -> bool:
+        if self._connection is None:
+            return False
+        connection, _ = self._connection
+        if connection.sock is None:
+            return False
+        if isinstance(connection, http.client.HTTPSConnection):
+            return True  # readable data may be a TLS session ticket
+        ended = select.poll()  # uvicorn closes a connection that is idle for 5 s
+        ended.register(connection.sock, select.POLLIN)
+        return not ended.poll(0)
+
+    def connect(self, timeout_s: float) -> dict[str, Any]:
+        metadata: Any = {}
+        if self.about is not None:
+            self._open(timeout_s)
+            path = f"{self._path.removesuffix(self.path)}{self.about}"
+            try:
+                metadata = json_numpy.loads(self._request("GET", path, None), self.options.limits)
+            except VLAgentsError as error:
+                raise PolicyUnavailable(f"{error}; want its metadata at {path}") from error
+            finally:
+                self.close()  # the upstream may have closed the connection
+        self._open(timeout_s)
+        return metadata if isinstance(metadata, dict) else {}
+
+    def _open(self, timeout_s: float) -> None:
+        secure = self._url.scheme == "https"
+        kind = http.client.HTTPSConnection if secure else http.client.HTTPConnection
+        connection = kind(self._url.hostname or "", self._url.port, timeout=timeout_s)
+        try:
+            connection.connect()
+        except OSError as error:
+            connection.close()
+            raise self.unreachable(error) from error
+        connection.sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+        connection.auto_open = 0
+        self._connection = connection, DeadlineSocket.install(connection)
+
+    def ask(self, observations: Sequence[Mapping[str, Any]]) -> list[Answer]:
+        [observation] = observations
+        return [self.decode(self._request("POST", self._path, self.encode(observation)))]
+
+    def _request(self, method: str, path: str, content: bytes | None) -> bytes:
+        if self._connection is None:
+            raise self.closed()
+        most = self.options.limits.body_bytes
+        connection, deadline_socket = self._connection
+        deadline_socket.begin_exchange(self.options.timeout_s)
+        try:
+            connection.request(method, path, content, self._headers)
+            response = connection.getresponse()
+            body = response.read(most + 1)
+        except (http.client.HTTPException, OSError) as error:
+            raise self.lost(error) from error
+        if len(body) > most:
+            self.close()
+            raise MessageTooLarge(f"upstream {self.options.url}: an answer of more than {most} bytes")
+        if response.will_close:
+            self.close()
+        if response.status in _BUSY:
+            raise ConnectionLost(f"upstream {self.options.url}: it answered with HTTP {response.status}")
+        if response.status != http.HTTPStatus.OK:
+            raise self.failed(body[:2000], f"HTTP {response.status}")
+        return body
+
+    def close(self) -> None:
+        if self._connection is not None:
+            connection, _ = self._connection
+            connection.close()
+            self._connection = None
+
+
+class OpenVLAClient(HttpClient):
+    """A client of `/act`, with arrays in the format of `json-numpy`."""
+
+    mapping: ClassVar[str | None] = "openvla"
+    path: ClassVar[str] = "/act"
+
+    @staticmethod
+    def is_nested(key: str) -> bool:  # noqa: ARG004 - overrides
+        return False  # an observation is one flat map
+
+    def encode(self, observation: Mapping[str, Any]) -> bytes:
+        return openvla.encode(observation)
+
+    def decode(self, body: bytes) -> np.ndarray:
+        if (action := openvla.decode_action(body, self.options.limits)) is None:
+            raise self.failed("error")
+        return action
+
+
+class SGLangClient(HttpClient):
+    """A client of SGLang's `/v1/actions`, in msgpack, which its WebSocket at `/openpi/policy` also uses."""
+
+    path: ClassVar[str] = "/v1/actions/generations"
+    about: ClassVar[str | None] = "/v1/actions/metadata"
+    media_type: ClassVar[str] = "application/msgpack"
+
+    def encode(self, observation: Mapping[str, Any]) -> bytes:
+        return openpi.encode({"input": {"observation": observation}, "runtime": {"response_format": "raw"}})
+
+    def decode(self, body: bytes) -> np.ndarray:
+        return self.actions(openpi.decode(body, self.options.limits))
+
+
+class FlashRTClient(HttpClient):
+    """A client of FlashRT's `/predict`: images without names in base64, in the order of the mapping.
+
+    Without images the server draws random ones, without a prompt it uses the last one of any client, and if an image is
+    missing, the next one takes its place. So a mapping of which one may be missing is refused.
+    """
+
+    path: ClassVar[str] = "/predict"
+    about: ClassVar[str | None] = "/health"
+    takes_key: ClassVar[bool] = False
+
+    def differences(self, metadata: Mapping[str, Any], outgoing: Outgoing) -> list[str]:
+        cameras, found = outgoing.mapping.cameras, []
+        unfit = [name for name, one in cameras.items() if one.optional or not re.fullmatch(r"images/[^/|*]+", one.key)]
+        if unfit or not cameras:
+            found.append(f"cameras: got {unfit}, want images/NAME for each, none optional; change mapping.cameras")
+        if (text := outgoing.mapping.instruction) != "prompt":
+            found.append(f"instruction: got {text!r}, want 'prompt'; change mapping.instruction")
+        return found
+
+    def encode(self, observation: Mapping[str, Any]) -> bytes:
+        images = list(observation["images"].values())
+        shapes = sorted({image.shape for image in images})
+        if len(shapes) != 1 or not observation.get("prompt"):
+            raise InvalidObservation(
+                f"flashrt: got images of {shapes} and the keys {sorted(observation)}, want images of one shape and a "
+                f"prompt; resize them, and reset with an instruction"
+            )
+        body = {name: value.tolist() if isinstance(value, np.ndarray) else value for name, value in observation.items()}
+        body["images"] = [base64.b64encode(image.tobytes()).decode() for image in images]
+        return json.dumps(body | {"image_shape": shapes[0]}).encode()
+
+    def decode(self, body: bytes) -> np.ndarray:
+        reply = json_numpy.loads(body, self.options.limits)
+        actions = reply.get("actions") if isinstance(reply, dict) else None
+        if not isinstance(actions, list):
+            raise self.unreadable(type(actions).__name__, "a map with a list `actions`")
+        return json_numpy.rows(actions)

@@ -1,0 +1,277 @@
+"""Clients of the protocols over WebSockets: openpi's, for one observation or a batch, RoboArena's and vla-eval's."""
+
+from __future__ import annotations
+
+import contextlib
+import importlib.metadata
+import inspect
+import logging
+import time
+import uuid
+from collections.abc import Mapping, Sequence
+from typing import Any, ClassVar
+
+import numpy as np
+from websockets.exceptions import ConnectionClosed, InvalidHandshake, InvalidStatus
+from websockets.protocol import State
+from websockets.sync.client import ClientConnection, connect
+
+from vlagents_ray.errors import PolicyUnavailable, Unauthorized, VLAgentsError
+from vlagents_ray_dialects.messages import openpi, vla_eval
+from vlagents_ray_dialects.messages.outgoing import Outgoing
+from vlagents_ray_dialects.upstream.client import Answer, ClientOptions, UpstreamClient
+
+_LOG = logging.getLogger("vlagents_ray.upstream.websocket")
+_LOG.setLevel(logging.CRITICAL)  # it logs each lost connection as an error, which is also raised
+_CLOSE_S = 1
+_REFUSED = (401, 403)
+# An upstream that computes on its event loop answers no pings meanwhile. Older versions of `websockets` send none.
+_NO_PINGS: dict[str, Any] = {"ping_interval": None} if "ping_interval" in inspect.signature(connect).parameters else {}
+
+
+class WebSocketClient(UpstreamClient):
+    """A client over a WebSocket, with limits on the size of messages and on the waiting time.
+
+    A separate thread answers the upstream's pings, so that a connection stays open while no session acts.
+    """
+
+    schemes: ClassVar[tuple[str, ...]] = ("ws", "wss")
+    key_scheme: ClassVar[str] = "Bearer"  # the word before the API key in the header `Authorization`
+
+    def __init__(self, options: ClientOptions) -> None:
+        super().__init__(options)
+        self._headers = {} if options.key is None else {"Authorization": f"{self.key_scheme} {options.key}"}
+        self._connection: ClientConnection | None = None
+        self._open = contextlib.ExitStack()
+
+    @property
+    def is_open(self) -> bool:
+        return self._connection is not None and self._connection.protocol.state is State.OPEN
+
+    def open(self, timeout_s: float) -> None:
+        """Connect; raises `PolicyUnavailable` if the upstream is unreachable, `Unauthorized` if it rejects the key."""
+        url = self.options.url
+        try:
+            opening = connect(
+                url,
+                open_timeout=timeout_s,
+                close_timeout=_CLOSE_S,
+                compression=None,
+                max_size=self.options.limits.body_bytes,
+                additional_headers=self._headers,
+                logger=_LOG,
+                **_NO_PINGS,
+            )
+            self._connection = self._open.enter_context(opening)
+        except InvalidStatus as error:
+            if error.response.status_code in _REFUSED:
+                raise Unauthorized(
+                    f"upstream {url}: it refuses the API key (HTTP {error.response.status_code}); name the environment "
+                    f"variable with the right one in key_env"
+                ) from error
+            raise PolicyUnavailable(f"upstream {url}: refused with HTTP {error.response.status_code}") from error
+        except (OSError, InvalidHandshake, ConnectionClosed, TimeoutError) as error:
+            raise self.unreachable(error) from error
+
+    def send(self, message: bytes) -> None:
+        try:
+            self._opened().send(message)
+        except (ConnectionClosed, OSError) as error:
+            raise self.lost(error) from error
+
+    def recv(self, timeout_s: float | None = None) -> bytes | str:
+        """Return the next message; raises `ConnectionLost` if the connection broke or timed out."""
+        wait_s = self.options.timeout_s if timeout_s is None else timeout_s
+        try:
+            return self._opened().recv(timeout=wait_s)
+        except TimeoutError as error:
+            raise self.lost(f"no answer within {wait_s:.3g} s") from error
+        except (ConnectionClosed, OSError) as error:
+            raise self.lost(error) from error
+
+    def close(self) -> None:
+        self._connection = None
+        self._open.close()
+
+    def _opened(self) -> ClientConnection:
+        if self._connection is None:
+            raise self.closed()
+        return self._connection
+
+
+class OpenPiClient(WebSocketClient):
+    """A client of servers with openpi's protocol, which keep no state between observations."""
+
+    key_scheme = "Api-Key"  # as openpi_client.websocket_client_policy sends it
+
+    @staticmethod
+    def is_nested(key: str) -> bool:
+        """Return whether a key is a path: `images/cam_high` is one, openpi's keys under `observation/` are not."""
+        return not key.startswith("observation/")
+
+    def connect(self, timeout_s: float) -> dict[str, Any]:
+        self.open(timeout_s)
+        try:
+            return self._map(self.recv(timeout_s))
+        except VLAgentsError as error:
+            self.close()
+            raise PolicyUnavailable(f"{error}; its first message must be its metadata") from error
+
+    def ask(self, observations: Sequence[Mapping[str, Any]]) -> list[Answer]:
+        [observation] = observations
+        return [self.actions(self._call(observation))]
+
+    def _call(self, message: Mapping[str, Any]) -> Any:
+        self.send(openpi.encode(message))
+        return self._read(self.recv())
+
+    def _read(self, data: bytes | str) -> Any:
+        return self._map(data)
+
+    def _map(self, data: bytes | str) -> dict[str, Any]:
+        """Return the map in a message; an error that is a text, or has the key `error`, ends the connection."""
+        reply: dict[str, Any] = self._good(data if isinstance(data, str) else openpi.decode(data, self.options.limits))
+        return reply
+
+    def _good(self, reply: Any) -> Any:
+        """Return a reply that is no error: openpi's is a text, SGLang's and vLLM-Omni's are maps."""
+        if isinstance(reply, str):
+            self.close()
+            raise self.failed(reply)
+        if isinstance(reply, dict) and reply.get("error") is not None:
+            self.close()
+            raise self.failed(reply["error"])
+        if isinstance(reply, dict) and reply.get("type") == "error":
+            raise self.failed(reply.get("message"))
+        return reply
+
+
+class OpenPiBatchClient(OpenPiClient):
+    """A client that sends `{"batch": [...]}`, as in openpi's pull request 941 and in our own dialect."""
+
+    batches: ClassVar[bool] = True
+
+    def ask(self, observations: Sequence[Mapping[str, Any]]) -> list[Answer]:
+        actions = self.actions(self._call({"batch": list(observations)}))
+        if actions.ndim != 3 or len(actions) != len(observations):
+            raise self.unreadable(f"actions {actions.shape}", f"({len(observations)}, H, D), one chunk an observation")
+        return list(actions)
+
+
+_RESET = "reset successful"  # the answer of RoboArena's servers to `reset`
+
+
+class RoboArenaClient(OpenPiClient):
+    """A client of RoboArena's servers, which keep a session for each `session_id` and have a reset."""
+
+    keeps_sessions: ClassVar[bool] = True
+    mapping: ClassVar[str | None] = "roboarena"
+
+    def __init__(self, options: ClientOptions) -> None:
+        super().__init__(options)
+        self._session = uuid.uuid4().hex
+
+    def ask(self, observations: Sequence[Mapping[str, Any]]) -> list[Answer]:
+        [observation] = observations
+        reply = self._call({**observation, "endpoint": "infer", "session_id": self._session})
+        return [reply if isinstance(reply, np.ndarray) else self.actions(reply)]
+
+    def begin(self) -> None:
+        self._session = uuid.uuid4().hex
+        self.send(openpi.encode({"endpoint": "reset"}))
+        if (answer := self.recv()) != _RESET:
+            self._read(answer)  # vLLM-Omni answers with a map; any text other than `_RESET` is an error
+
+    def differences(self, metadata: Mapping[str, Any], outgoing: Outgoing) -> list[str]:
+        cameras = [camera.key.partition("|")[0] for camera in outgoing.mapping.cameras.values()]
+        found = []
+        external = metadata.get("n_external_cameras")
+        have = sum("wrist" not in key for key in cameras)  # vLLM-Omni's π0 has no key with "exterior"
+        if isinstance(external, int) and external > have:
+            found.append(
+                f"cameras: the upstream needs {external} external ones, the mapping has {have}; "
+                f"add them to mapping.cameras"
+            )
+        if metadata.get("needs_wrist_camera") is True and not any("wrist" in key for key in cameras):
+            found.append(
+                "cameras: the upstream needs one at the wrist, the mapping has none; add it to mapping.cameras"
+            )
+        return found
+
+    def _read(self, data: bytes | str) -> Any:
+        """Return a map, or the array that older servers and vLLM-Omni send."""
+        return self._good(data if isinstance(data, str) else openpi.decode_any(data, self.options.limits))
+
+
+_STATED = ("model_server", "harness_version", "protocol_version", "observation_params", "action_spec")
+
+
+class VlaEvalClient(WebSocketClient):
+    """A client that announces episodes, and requests one action per step."""
+
+    keeps_sessions: ClassVar[bool] = True
+    mapping: ClassVar[str | None] = "vla-eval"
+
+    def __init__(self, options: ClientOptions) -> None:
+        super().__init__(options)
+        self._seq = 0
+        self._begun = -1  # the number of the last message that began an episode
+
+    def connect(self, timeout_s: float) -> dict[str, Any]:
+        self.open(timeout_s)
+        version = importlib.metadata.version("vlagents-ray")
+        try:
+            self._send(
+                "hello", {"harness_version": f"vlagents-ray {version}", "protocol_version": vla_eval.PROTOCOL_VERSION}
+            )
+            hello = self._answer("hello", timeout_s)
+        except VLAgentsError as error:
+            self.close()
+            raise PolicyUnavailable(f"{error}; it did not answer `hello`") from error
+        if (theirs := hello.get("protocol_version")) != vla_eval.PROTOCOL_VERSION:
+            self.close()
+            raise PolicyUnavailable(
+                f"upstream {self.options.url}: got protocol version {str(theirs)[:20]}, "
+                f"want {vla_eval.PROTOCOL_VERSION}"
+            )
+        return {name: hello[name] for name in _STATED if name in hello}
+
+    def begin(self) -> None:
+        self._send("episode_start", {})
+        self._begun = self._seq
+
+    def ask(self, observations: Sequence[Mapping[str, Any]]) -> list[Answer]:
+        [observation] = observations
+        self._send("observation", dict(observation))
+        payload = self._answer("action", self.options.timeout_s)
+        actions = payload.get("actions", payload.get("action"))
+        if isinstance(actions, list):
+            actions = np.asarray(actions, np.float32) if all(isinstance(one, int | float) for one in actions) else None
+        if not isinstance(actions, np.ndarray):
+            raise self.unreadable(sorted(map(str, payload))[:8], "a payload with an array `actions`")
+        return [actions]
+
+    def differences(self, metadata: Mapping[str, Any], outgoing: Outgoing) -> list[str]:
+        params = metadata.get("observation_params")
+        wants_state = isinstance(params, dict) and params.get("send_state") is True
+        if wants_state and not outgoing.mapping.state:
+            return ["state: the upstream needs it (send_state), the mapping has none; add it to mapping.state"]
+        return []
+
+    def _send(self, kind: vla_eval.Kind, payload: dict[str, Any]) -> None:
+        self._seq += 1
+        self.send(vla_eval.encode(vla_eval.Message(kind, payload, self._seq)))
+
+    def _answer(self, kind: vla_eval.Kind, timeout_s: float) -> dict[str, Any]:
+        """Return the payload of the answer to the last message; older answers are skipped."""
+        deadline = time.monotonic() + timeout_s
+        while True:
+            data = self.recv(max(0.0, deadline - time.monotonic()))
+            if isinstance(data, str):
+                self.close()
+                raise self.unreadable("a text", "a binary map")
+            message = vla_eval.decode(data, self.options.limits)
+            if message.kind == "error" and message.seq in (self._seq, self._begun):
+                raise self.failed(message.payload)
+            if message.seq == self._seq and message.kind == kind:
+                return message.payload

@@ -1,0 +1,215 @@
+"""vla-eval's benchmarks over WebSocket: they send "hello", the begin and end of episodes, and an observation per step.
+
+A benchmark executes one action per step, so each reply holds one row of a chunk. A benchmark that sends observations
+without waiting (its live mode) gets a reply to the newest one; the server does not act on older ones.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import uuid
+from collections import deque
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import partial
+from typing import Any, ClassVar
+
+from pydantic import Field
+from starlette.requests import Request as HttpRequest
+from starlette.responses import JSONResponse, Response
+from starlette.routing import BaseRoute, Route
+from starlette.websockets import WebSocket, WebSocketDisconnect
+
+from vlagents_ray.chunking.buffer import ChunkBuffer
+from vlagents_ray.errors import MalformedMessage, MessageTooLarge, PolicyUnavailable, VLAgentsError, shown
+from vlagents_ray.protocol.messages import RankName
+from vlagents_ray.serve.config.dialects import DialectConfig, MappingSetting
+from vlagents_ray.serve.dialects import base
+from vlagents_ray.serve.endpoints.http_messages import problem_response, public_problem
+from vlagents_ray.serve.engine.admission import MessageAdmission
+from vlagents_ray.serve.engine.sender import REFUSED, Sender
+from vlagents_ray_dialects.messages import vla_eval
+from vlagents_ray_dialects.messages.vla_eval import PRESETS
+
+_WAITING = 16  # maximum number of waiting messages of a client that does not wait for replies
+
+
+class VlaEvalDialectConfig(DialectConfig):
+    """The settings of vla-eval's benchmarks."""
+
+    mapping: MappingSetting = "vla-eval"
+    rank: RankName = "simulation"
+    execute: int | None = Field(default=None, ge=1, description="rows of each chunk that are executed; null: all")
+    observation_params: dict[str, Any] = Field(
+        default_factory=dict, description="what benchmarks are asked for, such as send_state: true"
+    )
+
+
+class VlaEvalDialect(base.RouteDialect):
+    """vla-eval's protocol, in which the client states the begin and the end of each episode."""
+
+    Config = VlaEvalDialectConfig
+    clients = "vla-eval"
+    summary = "A session is the connection, which says where episodes begin and end. An error is an `error` message."
+    paths: ClassVar[Mapping[str, str]] = {"WS /vla-eval": "stream"}
+    root = "vla_eval"
+    presets = PRESETS
+    config: VlaEvalDialectConfig
+
+    def routes(self) -> list[BaseRoute]:
+        return [*super().routes(), Route("/health", self.health)]
+
+    def at_root(self, sharing: Sequence[VlaEvalDialect]) -> base.Stream:
+        return self.stream
+
+    async def health(self, _http: HttpRequest) -> Response:
+        """Reply whether the policy is ready, like vla-eval's own servers."""
+        try:
+            self.context.engine.require_ready()
+        except VLAgentsError as error:
+            return problem_response(error, "", PolicyUnavailable.status)
+        return JSONResponse({"status": "ok"})
+
+    async def stream(self, socket: WebSocket) -> None:
+        """Serve one connection; its session ends with it."""
+        if not await base.accept_or_refuse(socket, self.context):
+            return
+        sender, gate = self.sender(), self.gate()
+        session, chunk = self.session(sender), ChunkBuffer()  # the buffer holds unsent rows
+        inbox = _Inbox()
+        reading = asyncio.ensure_future(inbox.fill(socket, gate, self))
+        try:
+            while (received := await inbox.next()) is not None:
+                if (answer := await self._answer(received, session, chunk)) is not None:
+                    await socket.send_bytes(vla_eval.encode(answer))
+            if inbox.end is not None:
+                await socket.close(base.POLICY_VIOLATION, inbox.end)
+        except WebSocketDisconnect:
+            return
+        finally:
+            sender.release(for_good=True)
+            reading.cancel()
+            with contextlib.suppress(asyncio.CancelledError):
+                await reading
+
+    async def _answer(
+        self, received: _Received, session: base.ImplicitSession, chunk: ChunkBuffer
+    ) -> vla_eval.Message | None:
+        message = received.message
+        if isinstance(message, VLAgentsError):
+            return _error(message, 0, uuid.uuid4().hex)
+        if message.kind == "hello":
+            return self._hello(message)
+        if message.kind in ("episode_start", "episode_end"):
+            chunk.drop()
+            session.episode.end()
+            return None
+        if message.kind != "observation":
+            return None  # the client reports an error
+        return await self._act(message, received.admission, session, chunk)
+
+    def _hello(self, message: vla_eval.Message) -> vla_eval.Message:
+        version = message.payload.get("protocol_version")
+        if type(version) is not int or version != vla_eval.PROTOCOL_VERSION:
+            error = MalformedMessage(f"protocol_version: got {shown(version, 20)}, want {vla_eval.PROTOCOL_VERSION}")
+            return _error(error, message.seq, uuid.uuid4().hex)
+        known = self.context.metadata()
+        payload: dict[str, Any] = {
+            "harness_version": f"vlagents-ray {known.get('version')}",
+            "protocol_version": vla_eval.PROTOCOL_VERSION,
+            "model_server": known.get("policy"),
+            "capabilities": {},
+        }
+        if self.config.observation_params:
+            payload["observation_params"] = self.config.observation_params
+        return vla_eval.Message("hello", payload, message.seq)
+
+    async def _act(
+        self, message: vla_eval.Message, admission: MessageAdmission, session: base.ImplicitSession, chunk: ChunkBuffer
+    ) -> vla_eval.Message:
+        incoming = self.arrived()
+        request_id = uuid.uuid4().hex
+        try:
+            # Some benchmarks render only the observations that begin a chunk: those of its other rows are not read.
+            text = self.mapping.read_instruction(message.payload, self.context.limits, self.context.contract)
+            if chunk.next is None or session.episode.begins(text):
+                payload = await admission.decoded(partial(vla_eval.decode_images, message.payload))
+                obs, instruction = self.read(payload)
+                if not session.episode.begun:
+                    self.mapping.warn_of_unread_cameras(payload, self.name)
+                incoming.decoded_alike()
+                reply = await session.act(incoming, obs, instruction, request_id)
+                rows = incoming.written(lambda: self.rows(reply))
+                chunk.replace(rows[: self.config.execute])
+            return vla_eval.Message("action", {"actions": chunk.take().action}, message.seq)
+        except Exception as error:  # noqa: BLE001 - the error is the reply to the client
+            problem = public_problem(error, self.name, request_id)
+            incoming.record_failure(problem.code)
+            return _error(problem, message.seq, request_id)
+        finally:
+            admission.release()
+
+
+@dataclass(slots=True)
+class _Received:
+    """A received message, whose images are not decoded yet, or the error of a refused message."""
+
+    message: vla_eval.Message | VLAgentsError
+    admission: MessageAdmission
+
+    @property
+    def is_observation(self) -> bool:
+        return isinstance(self.message, vla_eval.Message) and self.message.kind == "observation"
+
+
+class _Inbox:
+    """The unprocessed messages of a client; an observation replaces one directly before it."""
+
+    def __init__(self) -> None:
+        self._messages: deque[_Received | None] = deque()
+        self._there = asyncio.Event()
+        self.end: str | None = None  # the reason why the server ends the connection
+
+    async def next(self) -> _Received | None:
+        """Wait for the oldest message and return it; None if the client is gone."""
+        while not self._messages:
+            self._there.clear()
+            await self._there.wait()
+        return self._messages.popleft()
+
+    async def fill(self, socket: WebSocket, gate: Sender, dialect: VlaEvalDialect) -> None:
+        """Receive messages until the client is gone, or too many of its messages wait for replies."""
+        try:
+            while not gate.refused_too_often:
+                if (received := await dialect.receive(socket, gate)) is None:
+                    return
+                data, admission = received
+                if len(self._messages) >= _WAITING:
+                    self.end = f"{_WAITING} messages wait for answers; send no more than that at once"
+                    self._put(_Received(MessageTooLarge(self.end), admission))
+                    return
+                self._put(await self._read(data, admission))
+            self.end = REFUSED
+        finally:
+            self._put(None)
+
+    @staticmethod
+    async def _read(data: bytes | None, admission: MessageAdmission) -> _Received:
+        """Decode a message, which counts as a request of the key."""
+        try:
+            message = await base.decoded(lambda data, budget: vla_eval.decode(data, budget.limits), data, admission)
+            return _Received(message, admission)
+        except Exception as error:  # noqa: BLE001 - the error is the reply to the client
+            return _Received(public_problem(error, "vla_eval", "of an unreadable message"), admission)
+
+    def _put(self, received: _Received | None) -> None:
+        last = self._messages[-1] if self._messages else None
+        if last is not None and received is not None and last.is_observation and received.is_observation:
+            self._messages.pop()
+        self._messages.append(received)
+        self._there.set()
+
+
+def _error(error: VLAgentsError, seq: int, request_id: str) -> vla_eval.Message:
+    return vla_eval.Message("error", {"error": f"{error} (request {request_id})", "code": error.code}, seq)

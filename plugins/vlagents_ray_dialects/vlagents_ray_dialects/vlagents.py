@@ -1,0 +1,454 @@
+"""Clients of the package `vlagents` over RPyC, with one thread and one session per client."""
+
+from __future__ import annotations
+
+import contextlib
+import importlib.metadata
+import logging
+import os
+import re
+import socket
+import stat
+import threading
+import time
+from collections.abc import Mapping
+from typing import Any, ClassVar
+
+from pydantic import BaseModel, Field, model_validator
+
+from vlagents_ray.contract import ActionSpec, Contract
+from vlagents_ray.errors import (
+    InvalidInput,
+    InvalidObservation,
+    MalformedMessage,
+    PolicyUnavailable,
+    VLAgentsError,
+    shown,
+)
+from vlagents_ray.interface import Obs
+from vlagents_ray.serve.access.api_keys import NoKey
+from vlagents_ray.serve.config.dialects import DialectConfig, KeylessPortConfig
+from vlagents_ray.serve.dialects.base import GatewayContext, PortDialect
+from vlagents_ray.serve.engine.admission import MessageAdmission
+from vlagents_ray.wire import json_numpy
+from vlagents_ray_dialects.acceptor import Acceptor
+from vlagents_ray_dialects.client_reader import ClientReader, share_of, shut_down
+from vlagents_ray_dialects.gateway_sessions import GatewaySessions, internal_error
+from vlagents_ray_dialects.messages import rpyc, vlagents
+from vlagents_ray_dialects.messages.rpyc import Handler, RpycCall
+
+logger = logging.getLogger(__name__)
+
+_FRAME_S = 30.0  # maximum time of a message, from its first byte to its last
+_SEND_S = 10.0  # maximum time for a client to accept a reply
+_METHODS = ("act", "reset", "name", "is_initialized", "git_status")
+_FOLDER = "/dev/shm"  # noqa: S108 - the folder of Linux for shared memory
+# The names that Python's `SharedMemory` generates; clients may name no other file in the folder.
+_NAME = re.compile(r"/?(psm_[0-9a-f]{1,32})")
+_KEPT = 64
+_END_S = 3.0
+
+
+class VlagentsConnection:
+    """One connection of a client, from its first byte to its last."""
+
+    def __init__(self, dialect: VlagentsDialect, connection: socket.socket) -> None:
+        self._context = context = dialect.context
+        self._dialect, self._connection = dialect, connection
+        self._session = GatewaySessions(context.connect, context.contract)
+        self._session.show(NoKey.OPEN, None)  # the protocol has no key, and the deployment accepted that
+        robot = dialect.config.rank == "robot"
+        self._share = share_of(connection)  # whose share of the bytes in flight its messages take
+        self._reader = ClientReader(connection, context.admission, robot=robot)
+        self._segments = SharedMemory(same_machine=dialect.config.shared_memory and _is_same_machine(connection))
+        self._sending = threading.Lock()
+        self._unanswered: int | None = None  # sequence number of the request that is being processed
+
+    def run(self) -> None:
+        """Process the client's requests until it disconnects, is silent for too long, or sends an invalid message."""
+        try:
+            self._connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+            while not self._dialect.closing and (frame := self._receive()) is not None:
+                if not self._handle(*frame):
+                    return
+        except (VLAgentsError, OSError, ValueError) as error:
+            logger.info("vlagents: disconnected a client: %s", error)
+        except Exception:
+            logger.exception("vlagents: disconnected a client")
+        finally:
+            shut_down(self._connection)
+            self._connection.close()
+            self._segments.close()
+            self._session.close()
+
+    def _handle(self, body: bytearray, compressed: bool) -> bool:
+        """Process one message; return False if the client closes the connection."""
+        try:
+            call = rpyc.read_call(body, compressed, self._context.limits.body_bytes)
+        except rpyc.Refused as refused:
+            self._send(rpyc.exception(refused.sequence, "AttributeError", str(refused)))
+            return True
+        if call is None:
+            return True
+        if call.handler is Handler.CLOSE:
+            return False
+        self._unanswered = call.sequence
+        return self._send_answer(self._answer(call))
+
+    def _send_answer(self, answer: bytes) -> bool:
+        """Answer the current request; return False if `end` has answered it already."""
+        with self._sending:
+            unanswered, self._unanswered = self._unanswered, None
+            if unanswered is not None:
+                self._send(answer)
+        return unanswered is not None
+
+    def stop_reading(self) -> None:
+        """Read no further requests: the connection ends after the answer to the current one. From any thread."""
+        shut_down(self._connection, socket.SHUT_RD)
+
+    def end(self) -> None:
+        """Answer the current request with an error, and end the connection. From any thread."""
+        error = PolicyUnavailable("the server is stopping; connect again")
+        with self._sending:
+            sequence, self._unanswered = self._unanswered, None
+            if sequence is not None:
+                with contextlib.suppress(OSError):  # the client is gone, or does not read
+                    self._send(rpyc.exception(sequence, "RuntimeError", f"{error.code}: {error}"))
+        shut_down(self._connection)
+
+    def _answer(self, call: RpycCall) -> bytes:
+        try:
+            if call.handler is Handler.GETROOT:
+                return rpyc.reference_reply(call.sequence, rpyc.ROOT)
+            if call.handler is Handler.GETATTR:
+                return rpyc.reference_reply(call.sequence, _number(call.args))
+            return rpyc.reply(call.sequence, self._value(call))
+        except VLAgentsError as error:
+            kind = next((one.__name__ for one in (TimeoutError, ValueError) if isinstance(error, one)), "RuntimeError")
+            return rpyc.exception(call.sequence, kind, f"{error.code}: {error}")
+        except Exception:  # noqa: BLE001 - logged, and answered
+            return rpyc.exception(call.sequence, "RuntimeError", internal_error("vlagents"))
+
+    def _value(self, call: RpycCall) -> Any:
+        if call.handler is Handler.PING:
+            return _echo(call)
+        if call.handler is Handler.DEL:
+            return None
+        if call.handler is Handler.INSPECT:
+            return tuple((name, None) for name in _METHODS)
+        method, args = _called(call)
+        if method in ("act", "reset"):
+            if len(args) != 1 or not isinstance(args[0], (str, bytes)):
+                raise MalformedMessage(f"{method}: want one argument, text")
+            return self._act(args[0]) if method == "act" else self._reset(args[0])
+        if args:
+            raise MalformedMessage(f"{method}: want no arguments")
+        if method == "name":
+            return self._dialect.config.name or self._context.app
+        if method == "is_initialized":
+            return True  # the gateway accepts clients only when the policy is loaded
+        return json_numpy.dumps({"vlagents_ray": importlib.metadata.version("vlagents-ray")})
+
+    def _act(self, text: str | bytes) -> str:
+        admission = self._admission(text)
+        seen = vlagents.read_act(text, admission, self._segments)
+        obs = self._ours(seen.obs)
+        act = self._session.act(obs, seen.instruction) if seen.robots else self._session.act_on(obs)
+        admission.release()
+        parts = self._dialect.parts
+        if isinstance(parts, vlagents.Part):
+            if len(seen.robots) > 1:
+                raise InvalidInput(
+                    f"got the robots {list(seen.robots)[:8]}; state their columns in dialects.vlagents.robots"
+                )
+            parts = dict.fromkeys(seen.robots, parts)
+        return vlagents.write_act(act, seen.robots, parts)
+
+    def _reset(self, text: str | bytes) -> str:
+        admission = self._admission(text)
+        seen, options = vlagents.read_reset(text, admission, self._segments)
+        info = self._session.reset(self._ours(seen.obs), seen.instruction, **options)
+        admission.release()
+        return json_numpy.dumps(info)
+
+    def _admission(self, text: str | bytes) -> MessageAdmission:
+        robot = self._dialect.config.rank == "robot"
+        return MessageAdmission(
+            self._context.admission,
+            self._context.limits,
+            None,
+            len(text),
+            robot=robot,
+            inline=False,
+            key=self._share,
+        )
+
+    def _ours(self, obs: Obs) -> Obs:
+        """Return the observation under the policy's names, converted if the deployment has a mapping."""
+        if (mapping := self._dialect.stated_mapping) is None:
+            return obs
+        theirs: dict[str, Any] = {"cameras": obs.cameras, "state": obs.state, "info": obs.info}
+        if obs.gripper is not None:
+            theirs["gripper"] = obs.gripper
+        ours, _ = mapping.obs(theirs, self._context.limits, self._context.contract)
+        if not self._session.begun:
+            mapping.warn_of_unread_cameras(theirs, "vlagents")
+        return ours
+
+    def _receive(self) -> tuple[bytearray, bool] | None:
+        """Receive the next message, and whether it is compressed; None if the client disconnected before it."""
+        header = self._reader.read(
+            rpyc.HEADER.size, self._context.idle_s, time.monotonic() + self._context.idle_s + _FRAME_S
+        )
+        if header is None:
+            return None
+        length, compressed = rpyc.read_header(bytes(header), self._context.limits.body_bytes)
+        if (body := self._reader.read(length, _FRAME_S, time.monotonic() + _FRAME_S)) is None:
+            raise ConnectionResetError("the client disconnected within a message")
+        return bytearray(body), compressed
+
+    def _send(self, frame: bytes) -> None:
+        self._connection.settimeout(_SEND_S)
+        self._connection.sendall(frame)
+
+
+def _echo(call: RpycCall) -> str | bytes | None:
+    """Return the value that a ping is answered with."""
+    match call.args:
+        case ():
+            return None
+        case (str() | bytes() | None as said, *_):
+            return said
+    raise MalformedMessage(f"ping: got {shown(call.args[0])}, want text")
+
+
+def _number(args: tuple[Any, ...]) -> int:
+    """Return the number that identifies the method a client looks up."""
+    match args:
+        case (rpyc.Reference(rpyc.ROOT), str(name)) if name in _METHODS:
+            return _METHODS.index(name) + 1
+    raise MalformedMessage(f"the server has {list(_METHODS)} and nothing else")
+
+
+def _called(call: RpycCall) -> tuple[str, tuple[Any, ...]]:
+    """Return the name of the method that a client calls, by number or by name, and the arguments."""
+    match call.handler, call.args:
+        case Handler.CALL, (rpyc.Reference(number), tuple(args), *options) if 0 < number <= len(_METHODS):
+            name = _METHODS[number - 1]
+        case Handler.CALLATTR, (rpyc.Reference(rpyc.ROOT), str(name), tuple(args), *options) if name in _METHODS:
+            pass
+        case _:
+            raise MalformedMessage(f"rpyc: want a call of one of {list(_METHODS)} of the root")
+    if any(options):
+        raise MalformedMessage(f"{name}: takes no arguments by name")
+    return name, args
+
+
+def _is_same_machine(connection: socket.socket) -> bool:
+    """Return whether the client is on this machine, in which case both ends have the same address."""
+    try:
+        return bool(connection.getpeername()[0] == connection.getsockname()[0])
+    except OSError:  # the client is already gone
+        return False
+
+
+# Access by name to the shared memory of a client on this machine.
+#
+# Segments are copied, never mapped: if a client shrinks a mapped segment, SIGBUS would end this process. This module
+# neither creates nor removes segments, nor registers them with Python's resource tracker, so that the client alone owns
+# them.
+
+
+class SharedMemory:
+    """The segments of one client, kept open between its requests."""
+
+    def __init__(self, *, same_machine: bool) -> None:
+        """Prepare to read; unless the client is on the `same_machine`, every name is refused."""
+        self._same_machine = same_machine
+        self._open: dict[str, int] = {}
+
+    def read(self, name: str, size: int) -> bytearray:
+        """Return a copy of the first `size` bytes of a segment; raise `InvalidObservation` if that is impossible."""
+        if not self._same_machine:
+            raise InvalidObservation(
+                "shared memory: the client is not on the server's machine; leave on_same_machine=False"
+            )
+        descriptor = self._descriptor(name)
+        if os.fstat(descriptor).st_size < size:  # checked before memory is allocated
+            raise InvalidObservation(f"shared memory {name[:40]!r}: shorter than the {size} bytes of its shape")
+        data = bytearray(size)
+        got = 0
+        while got < size:
+            if (more := os.preadv(descriptor, [memoryview(data)[got:]], got)) == 0:
+                raise InvalidObservation(f"shared memory {name[:40]!r}: became shorter while it was read")
+            got += more
+        return data
+
+    def close(self) -> None:
+        """Close all segments, without removing them."""
+        for descriptor in self._open.values():
+            os.close(descriptor)
+        self._open.clear()
+
+    def _descriptor(self, name: str) -> int:
+        if (match := _NAME.fullmatch(name)) is None:
+            raise InvalidObservation(f"shared memory: got the name {name[:40]!r}, want one like 'psm_01234567'")
+        if (known := self._open.get(match[1])) is not None:
+            return known
+        try:
+            descriptor = os.open(f"{_FOLDER}/{match[1]}", os.O_RDONLY | os.O_NOFOLLOW | os.O_CLOEXEC | os.O_NONBLOCK)
+        except OSError as error:
+            raise InvalidObservation(f"shared memory {name[:40]!r}: cannot be opened ({error.strerror})") from error
+        if not stat.S_ISREG(os.fstat(descriptor).st_mode):
+            os.close(descriptor)
+            raise InvalidObservation(f"shared memory {name[:40]!r}: is none")
+        if len(self._open) >= _KEPT:  # a client creates another segment when its images grow
+            os.close(self._open.pop(next(iter(self._open))))
+        self._open[match[1]] = descriptor
+        return descriptor
+
+
+class GripperArgs(BaseModel, extra="forbid"):
+    """The column of a robot's gripper in a row of the policy's actions, and its values."""
+
+    column: int = Field(default=-1, description="as in Python: -1 is the last")
+    open: float | None = Field(default=None, description="its value for open; default: the policy's contract, or 1")
+    closed: float | None = Field(default=None, description="and for closed; default: the policy's contract, or 0")
+
+    @model_validator(mode="after")
+    def _two_values(self) -> GripperArgs:
+        if self.open is not None and self.open == self.closed:
+            raise ValueError(f"open and closed are both {self.open}; they must differ")
+        return self
+
+
+class RobotArgs(BaseModel, extra="forbid"):
+    """The columns of one robot in a row."""
+
+    start: int | None = None
+    stop: int | None = None
+    gripper: GripperArgs | None = Field(
+        default=None, description="the column that goes into SingleAct.gripper; unset: none"
+    )
+
+
+class VlagentsDialectConfig(KeylessPortConfig):
+    """The settings of the RPyC protocol of the package `vlagents`, 0.2 and 0.3.
+
+    A mapping reads cameras/NAME, state/NAME, gripper, info; without one, the client's names stay as they are.
+    """
+
+    port: int = Field(default=8080, ge=1, le=65535)
+    name: str | None = Field(
+        default=None, description="the model's name, which clients must give; default: the application's"
+    )
+    gripper: GripperArgs | None = Field(
+        default=None, description="of the only robot: the column that goes into SingleAct.gripper; unset: none"
+    )
+    robots: dict[str, RobotArgs] = Field(default_factory=dict, description="with several, which columns are whose")
+    shared_memory: bool = Field(default=True, description="read the cameras of clients on this machine in place")
+
+    @model_validator(mode="after")
+    def _one_way(self) -> VlagentsDialectConfig:
+        if self.gripper is not None and self.robots:
+            raise ValueError("gripper is for a single robot; with robots, state each robot's own")
+        return self
+
+
+class VlagentsDialect(PortDialect):
+    """The protocol of the package `vlagents`, with one thread and one session per client."""
+
+    Config = VlagentsDialectConfig
+    clients = "vlagents"
+    summary = (
+        "A session is the connection; an episode begins with `reset` and with each new instruction. An error "
+        "is raised at the client as a built-in exception."
+    )
+    scheme = "rpyc"
+    presets: ClassVar[Mapping[str, Mapping[str, Any]]] = {
+        # this project's own names, for clients that need a mapping but whose protocol defines no names
+        "vlagents": {
+            "cameras": {"*": "cameras/*"},
+            "state": {"*": "state/*"},
+            "gripper": {"key": "gripper", "optional": True},
+            "instruction": "instruction",
+            "info": {"info": "info"},
+        }
+    }
+    config: VlagentsDialectConfig
+
+    def __init__(self, name: str, config: VlagentsDialectConfig, context: GatewayContext) -> None:
+        super().__init__(name, config, context)
+        self.stated_mapping = config.keys()  # None if clients use this project's names
+        spec = ActionSpec() if context.contract is None else context.contract.action
+        # The columns of each robot, or of the only one.
+        self.parts: Mapping[str, vlagents.Part] | vlagents.Part = {
+            name: _part(robot, spec) for name, robot in config.robots.items()
+        } or _part(RobotArgs(gripper=config.gripper), spec)
+        self._clients: dict[threading.Thread, VlagentsConnection] = {}
+        self._lock = threading.Lock()
+        self._closing = threading.Event()
+        self._acceptor: Acceptor | None = None
+
+    @classmethod
+    def lacks(cls, config: DialectConfig, contract: Contract | None) -> list[str]:  # noqa: ARG003 - overrides
+        """Return nothing: the instruction is sent beside the observation, and `robots` states each robot's columns."""
+        return []
+
+    def serve(self, listener: socket.socket) -> None:
+        self._acceptor = Acceptor("vlagents", listener, self._add)
+
+    def alive(self) -> bool:
+        return self._acceptor is not None and self._acceptor.alive()
+
+    @property
+    def closing(self) -> bool:
+        """Whether no further requests are read."""
+        return self._closing.is_set()
+
+    def close(self) -> None:
+        """Accept no clients, answer the requests that have arrived, and end all sessions."""
+        self._closing.set()
+        if self._acceptor is not None:
+            self._acceptor.close()
+        with self._lock:
+            clients = dict(self._clients)
+        for client in clients.values():
+            client.stop_reading()
+        deadline = time.monotonic() + _END_S
+        for thread, client in clients.items():
+            thread.join(max(0.0, deadline - time.monotonic()))
+            if thread.is_alive():
+                client.end()
+
+    def _add(self, connection: socket.socket) -> None:
+        client = VlagentsConnection(self, connection)
+        thread = threading.Thread(target=self._serve, args=(client,), name="vlagents-client", daemon=True)
+        with self._lock:
+            is_full = len(self._clients) >= self.context.sessions
+            if not is_full:
+                self._clients[thread] = client
+        if is_full:
+            logger.warning("vlagents: %d clients are connected, the limit; one was refused", self.context.sessions)
+            connection.close()
+        else:
+            thread.start()
+
+    def _serve(self, client: VlagentsConnection) -> None:
+        try:
+            client.run()
+        finally:
+            with self._lock:
+                del self._clients[threading.current_thread()]
+
+
+def _part(robot: RobotArgs, spec: ActionSpec) -> vlagents.Part:
+    if (gripper := robot.gripper) is None:
+        return vlagents.Part(robot.start, robot.stop)
+    opened, closed = _first(gripper.open, spec.gripper_open, 1.0), _first(gripper.closed, spec.gripper_closed, 0.0)
+    return vlagents.Part(robot.start, robot.stop, gripper.column, opened, closed)
+
+
+def _first(*values: float | None) -> float:
+    return next(value for value in values if value is not None)

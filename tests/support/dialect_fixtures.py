@@ -1,0 +1,63 @@
+"""All dialects of the server's own port over one engine, and those with a port of their own over others."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import pytest
+from dialect_server import ALL, serving
+from in_process_replicas import Replicas
+from served_agents import Mirror, Witness
+from starlette.testclient import TestClient
+
+from vlagents_ray.client.agent import RemoteAgent
+from vlagents_ray.protocol.messages import Limits, RankName
+from vlagents_ray.registry import dialect_class
+from vlagents_ray.serve.access.api_keys import NoKey
+from vlagents_ray.serve.dialects.base import GatewayContext, PortDialect
+from vlagents_ray.serve.engine.engine import Engine
+from vlagents_ray.serve.ports import free_port, reserve
+
+LIMITS = Limits(body_bytes=2 * 2**20)
+OpenPort = Callable[..., int]
+
+
+@pytest.fixture(scope="module", name="context")
+def everything() -> Iterator[tuple[TestClient, Engine]]:
+    with serving(Mirror(chunk=2), ALL) as context:
+        yield context
+
+
+@pytest.fixture(name="replicas")
+def one_replica() -> Iterator[Replicas]:
+    replicas = Replicas([Witness()])
+    yield replicas
+    replicas.close()
+
+
+@pytest.fixture
+def open_dialect(replicas: Replicas) -> Iterator[OpenPort]:
+    """Serve the clients of a dialect with a port of its own, by its name; returns the port."""
+    dialects: list[PortDialect] = []
+
+    def connect(_key: str | None, rank: RankName | None) -> RemoteAgent:
+        return replicas.agent(rank=rank or "robot")
+
+    def open_port(
+        name: str, sessions: int = 8, idle_s: float = 30.0, check: Any = NoKey.OPEN, **settings: object
+    ) -> int:
+        cls = dialect_class(name)
+        config = cls.Config(port=free_port(), **settings)
+        context = GatewayContext("noop", connect, LIMITS, sessions, idle_s, None, check)
+        dialect = cls(name, config, context)
+        dialect.serve(reserve(name, "127.0.0.1", config.port))
+        dialects.append(dialect)
+        port: int = config.port
+        return port
+
+    yield open_port
+    for dialect in dialects:
+        assert dialect.alive()
+        dialect.close()
+        assert not dialect.alive()

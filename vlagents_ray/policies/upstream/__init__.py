@@ -1,5 +1,0 @@
-"""Other policy servers' models behind our queue, sessions, keys, evaluation and live view."""
-
-from vlagents_ray.policies.upstream.policy import Upstream
-
-__all__ = ["Upstream"]
