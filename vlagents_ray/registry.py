@@ -204,7 +204,6 @@ _EXTRAS: dict[str, tuple[str, ...]] = {
         "rich",
         "grpc",
     ),
-    "gr00t": ("zmq",),
     "arms": ("mujoco_menagerie",),
     "bench": ("matplotlib",),
     "sim": ("gymnasium",),
@@ -229,12 +228,13 @@ _BROUGHT = {"torchvision": "torch", "tokenizers": "transformers", "safetensors":
 }
 
 
-def require(module: str, *, extra: str | None = None) -> ModuleType:
+def require(module: str, *, extra: str | None = None, distribution: str = CORE) -> ModuleType:
     """Import an optional module.
 
     Args:
         module: The module's full name, e.g. "torch" or "openpi.models.model".
-        extra: The extra of this package that installs it for the caller, if different from the usual one.
+        extra: The extra that installs it for the caller, if different from the usual one.
+        distribution: The distribution of that extra.
 
     Raises:
         MissingDependency: The module is not installed; the message names the extra or the requirements file with it.
@@ -245,17 +245,17 @@ def require(module: str, *, extra: str | None = None) -> ModuleType:
         top = module.partition(".")[0]
         if error.name is None or error.name.partition(".")[0] != top:
             raise  # the module is installed, but lacks a dependency, which this error names
-        raise MissingDependency(f"{module!r} is not installed; {_install(top, extra)}") from error
+        raise MissingDependency(f"{module!r} is not installed; {_install(top, extra, distribution)}") from error
 
 
-def _install(package: str, extra: str | None = None) -> str:
+def _install(package: str, extra: str | None = None, distribution: str = CORE) -> str:
     """Return how to install an optional package, as the end of an error message."""
     simulators = [entry for entry in entries("envs").values() if package in entry.needs]
     policies = entries("policies").values()
     users = [entry for entry in (*simulators, *policies) if package in entry.needs]
     extra = extra or next((name for name, installed in _EXTRAS.items() if package in installed), None)
     if extra:
-        return pip_install(extra)
+        return pip_install(extra, distribution)
     with_extra = next((entry for entry in users if entry.extra), None)
     if with_extra is not None:
         return pip_install(with_extra.extra, with_extra.distribution)

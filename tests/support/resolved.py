@@ -163,7 +163,11 @@ def families() -> list[Path]:
 def locks() -> dict[str, tuple[str, list[str]]]:
     """Of each lock's name the Python and the requirements."""
     of_core = [extra for extra in EXTRAS if f"{PROJECT['name']}[sim]" in EXTRAS[extra]]
-    of_plugins = [extra for extra, wanted in OF_PLUGINS.items() if f"{PROJECT['name']}[maniskill]" not in wanted]
+    of_plugins = []  # simulators, but for SIMPLER, which is in the image of ManiSkill
+    for extra, wanted in OF_PLUGINS.items():
+        needed = {name for text in wanted for name in Requirement(text).extras}
+        if "sim" in needed and "maniskill" not in needed:
+            of_plugins.append(extra)
     servers = dict.fromkeys(["serve", "sim", *of_core, *of_plugins])
     found = {f"server-{extra}": (SERVER_PYTHON, direct(extra)) for extra in servers}
     for file in families():

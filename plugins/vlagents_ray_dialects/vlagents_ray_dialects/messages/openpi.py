@@ -13,7 +13,7 @@ import numpy as np
 from vlagents_ray.errors import MalformedMessage, MessageTooLarge, shown
 from vlagents_ray.protocol.frame_layout import plain_dtype, read_array
 from vlagents_ray.protocol.messages import DEFAULT_LIMITS, Limits
-from vlagents_ray.wire.mapping import ALOHA_ACTION, ALOHA_STATE, libero_state
+from vlagents_ray_dialects.messages.layouts import ALOHA_ACTION, ALOHA_STATE, libero_state
 from vlagents_ray_dialects.messages.msgpack import pack, unpack
 
 

@@ -15,7 +15,7 @@ import numpy as np
 from vlagents_ray.errors import MalformedMessage, MessageTooLarge
 from vlagents_ray.protocol.messages import DEFAULT_LIMITS, Limits
 from vlagents_ray.wire import json_numpy
-from vlagents_ray.wire.mapping import ALOHA_ACTION, ALOHA_STATE, libero_state
+from vlagents_ray_dialects.messages.layouts import ALOHA_ACTION, ALOHA_STATE, libero_state
 
 
 def decode(body: bytes, limits: Limits = DEFAULT_LIMITS) -> tuple[dict[str, Any], bool]:

@@ -27,7 +27,7 @@ class GR00TClient(UpstreamClient):
 
     def __init__(self, options: ClientOptions) -> None:
         super().__init__(options)
-        self._zmq = require("zmq")
+        self._zmq = require("zmq", extra="gr00t", distribution="vlagents-ray-dialects")
         self._context: Any = None
         self._socket: Any = None
         self._monitor: Any = None

@@ -1,4 +1,4 @@
-"""Recordings of the message code of SGLang, vLLM-Omni and FlashRT, for tests/policies/upstream/test_engines.py.
+"""Recordings of the message code of SGLang, vLLM-Omni and FlashRT, for `upstream/test_engines.py` of the dialects.
 
 `python tests/support/engine_frames.py SGLANG_WHEEL VLLM_OMNI_WHEEL FLASHRT_SERVER` runs the modules of two wheels that
 read and write messages, and FlashRT's `examples/server.py`, on a CPU and without a network. The model is replaced by a
@@ -22,7 +22,7 @@ from typing import Any
 
 import numpy as np
 
-FOLDER = Path(__file__).parents[1] / "policies/upstream/engines"
+FOLDER = Path(__file__).parents[1] / "upstream/engines"
 CAMERAS = ("base_0_rgb", "left_wrist_0_rgb")
 ROWS, COLUMNS = 3, 4
 OWN = (
