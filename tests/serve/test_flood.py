@@ -176,7 +176,14 @@ def alone_ms() -> dict[str, list[float]]:
     return {}
 
 
-GATEWAY_TABLE = [(way, name) for way, behaviours in flood.GATEWAYS.items() for name in behaviours]
+# A client without a key has a rate for each connection, of 150 requests a second, and none for its address, which may
+# be that of many robots; docs/other_clients.md has a rule for a firewall.
+OF_MANY_CLIENTS = pytest.mark.xfail(strict=False, reason="eight clients without a key send 1,200 requests a second")
+GATEWAY_TABLE = [
+    pytest.param(way, name, marks=[OF_MANY_CLIENTS] if (way, name) == ("lerobot", "requests") else [])
+    for way, behaviours in flood.GATEWAYS.items()
+    for name in behaviours
+]
 
 
 @pytest.mark.parametrize(("way", "behaviour"), [*TABLE, *GATEWAY_TABLE])
