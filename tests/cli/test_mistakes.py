@@ -299,6 +299,32 @@ def test_a_mistake_on_the_command_line_is_answered_with_its_cure(mistake: str, f
     assert sorted(os.listdir(folder)) == sorted([*before, *(["out"] if mistake in MADE else [])])
 
 
+@pytest.mark.parametrize("words", [["keys", "new", "x", "--keys", "new.json"], ["new", "policy", "mine"]])
+def test_a_full_disk_is_named_and_nothing_is_left(
+    words: list[str], folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    before, real = sorted(os.listdir(folder)), Path.open
+
+    def opened(path: Path, mode: str = "r", **options: Any) -> Any:
+        if mode != "x":
+            return real(path, mode, **options)
+        path.touch()
+        return open("/dev/full", "w")
+
+    def of_descriptor(descriptor: int, *_: Any, **_options: Any) -> Any:
+        os.close(descriptor)
+        return open("/dev/full", "w")
+
+    monkeypatch.setattr(Path, "open", opened)
+    monkeypatch.setattr(os, "fdopen", of_descriptor)
+    status, message = answer(words)
+    assert (status, message) == (
+        1,
+        "error the disk is full (No space left on device); make room, and repeat the command",
+    )
+    assert sorted(os.listdir(folder)) == before
+
+
 @pytest.mark.parametrize("policy", EPISODES)
 def test_a_mistake_in_a_policy_is_answered_with_its_place(policy: str) -> None:
     status, message = answer([*EVAL, f"own:{policy}"])

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import errno
 import itertools
 import json
 import os
@@ -92,6 +93,8 @@ def errors(*settings: type[BaseModel]) -> Iterator[None]:
     except VLAgentsError as error:
         fail(f"{type(error).__name__}: {error}", 1)
     except OSError as error:
+        if error.errno in (errno.ENOSPC, errno.EDQUOT):
+            fail(f"the disk is full ({error.strerror}); make room, and repeat the command", 1)
         if error.filename is None:
             raise
         fail(f"{error.filename}: cannot be used: {error.strerror}; choose another path, or change its permissions", 1)

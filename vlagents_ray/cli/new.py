@@ -105,10 +105,15 @@ def _write(name: str, kind: Literal["policy", "env", "dialect", "plugin"]) -> No
         raise ConfigError(f"{', '.join(there)}: there already, and nothing was written; choose another NAME")
     if importlib.util.find_spec(name) is not None:
         raise ConfigError(f"NAME: {name!r} is a module that is installed, and yours would hide it; choose another one")
-    for path, text in texts.items():
-        path.parent.mkdir(parents=True, exist_ok=True)
-        with path.open("x") as written:
-            written.write(text)
+    try:
+        for path, text in texts.items():
+            path.parent.mkdir(parents=True, exist_ok=True)
+            with path.open("x") as written:
+                written.write(text)
+    except OSError:
+        for path in texts:
+            path.unlink(missing_ok=True)
+        raise
     out.print(f"wrote {', '.join(map(str, texts))}. Next, in this folder:")
     if kind != "plugin":
         _print_steps((f"{as_typed('python')} test_{name}.py", "checks it; so does pytest"))

@@ -22,6 +22,8 @@ from vlagents_ray.evaluate.results.statistics import Rate, Stopping, place_in_pl
 
 KILLED = "killed"  # the state of a run that ended without saying so
 
+_SQLITE_FULL = 13  # sqlite3.SQLITE_FULL, from Python 3.11 on
+
 
 @dataclass(frozen=True, slots=True)
 class Episode:
@@ -238,6 +240,8 @@ def reading(out: Path) -> Iterator[sqlite3.Connection]:
             db.execute("BEGIN")
             yield db
     except sqlite3.DatabaseError as error:
+        if getattr(error, "sqlite_errorcode", None) == _SQLITE_FULL:  # where the caller writes a copy
+            raise
         raise ConfigError(
             f"{out / FILE}: cannot be read ({error}); if its evaluation was killed, --resume mends it; else take a "
             f"copy of the whole folder from where it was written"
