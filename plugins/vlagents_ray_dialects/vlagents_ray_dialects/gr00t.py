@@ -88,8 +88,13 @@ class GR00TConnection(GatewayClient):
             self._answered.wait_for(lambda: not self._unanswered, max(0.0, until - time.monotonic()))
 
     def refuse_waiting(self, error: VLAgentsError) -> None:
-        """Answer the request that is being processed, if there is one, with an error; may be called on any thread."""
-        self._send(_error(error))
+        """Answer the request that is being processed with an error, and end the connection; on any thread.
+
+        The connection's thread waits for the policy and would not read the client's next request: after the end, ZeroMQ
+        keeps that request for the server's successor.
+        """
+        if self._send(_error(error)):
+            self.cut_off("the server is stopping")
 
     def _run(self) -> None:
         try:
@@ -200,13 +205,15 @@ class GR00TConnection(GatewayClient):
         self._send(answer)
         time.sleep(self.sessions.throttled_s())
 
-    def _send(self, answer: bytes) -> None:
-        """Send the answer to the current request, unless it has one."""
+    def _send(self, answer: bytes) -> bool:
+        """Send the answer to the current request, and return True; False if it already has one."""
         with self._sending:
             envelope, self._waiting = self._waiting, None
-            if envelope is not None:
-                self._connection.settimeout(_SEND_S)
-                self._connection.sendall(zmtp.write_message([*envelope, answer]))
+            if envelope is None:
+                return False
+            self._connection.settimeout(_SEND_S)
+            self._connection.sendall(zmtp.write_message([*envelope, answer]))
+            return True
 
     # The messages.
 
