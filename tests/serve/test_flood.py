@@ -12,6 +12,7 @@ from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from http.client import HTTPConnection
 from pathlib import Path
+from subprocess import Popen
 
 import flood
 import grpc
@@ -27,7 +28,7 @@ from vlagents_ray_dialects.messages import lerobot
 
 pytestmark = [pytest.mark.alone, pytest.mark.slow, pytest.mark.integration]
 
-SECONDS = 3.0
+SECONDS = 1.5  # 100 acts
 # Of each row of the table. p99 needs a quiet machine and 10 s or more; the rows are printed by `pytest -s`.
 ROW_SECONDS = float(os.environ.get("VLAGENTS_FLOOD_SECONDS", "1.5"))
 MEMORY_MB = 150  # what eight connections of one key may take: for each, a part of a message and what uvicorn copies
@@ -46,6 +47,12 @@ CASES = [
 def where() -> Iterator[flood.Where]:
     with flood.child("serve") as server:
         yield {**json.loads(server.stdout.readline()), "pid": server.pid}
+
+
+@pytest.fixture(scope="module")
+def attackers() -> Iterator[Popen[str]]:
+    with flood.child("attacks") as process:
+        yield process
 
 
 def await_calm(server: int) -> None:
@@ -69,7 +76,7 @@ def robot(where: flood.Where) -> Iterator[ShmTransport]:
 
 @pytest.mark.parametrize(("way", "part", "connections"), CASES)
 def test_a_robots_act_takes_less_than_twice_as_long(
-    where: flood.Where, robot: ShmTransport, way: str, part: str, connections: int
+    where: flood.Where, robot: ShmTransport, attackers: Popen[str], way: str, part: str, connections: int
 ) -> None:
     """The median, and p90 against that of the same robot alone in the same attempt.
 
@@ -78,8 +85,7 @@ def test_a_robots_act_takes_less_than_twice_as_long(
     found = []
     for _ in range(ATTEMPTS):
         alone = flood.acts_ms(robot, SECONDS)
-        with flood.child("attack", way, part, json.dumps(where), str(connections), "60") as attacker:
-            assert attacker.stdout.readline() == "begun\n"
+        with flood.attacking(attackers, way, part, where, connections):
             await_calm(where["pid"])
             beside = flood.acts_ms(robot, SECONDS)
         p50, p90 = ((flood.percentile(alone, n), flood.percentile(beside, n)) for n in (50, 90))
@@ -192,6 +198,7 @@ def test_no_behaviour_of_a_connection_delays_a_robot_or_leaves_anything(
     gateways: flood.Where,
     page: flood.Where,
     robots: dict[str, Robot],
+    attackers: Popen[str],
     alone_ms: dict[str, list[float]],
     way: str,
     behaviour: str,
@@ -211,8 +218,7 @@ def test_no_behaviour_of_a_connection_delays_a_robot_or_leaves_anything(
             await_calm(where["pid"])  # an attempt before this one may have left much to do
             alone_ms[name] = flood.times_ms(call, ROW_SECONDS)
         alone = alone_ms[name]
-        with flood.child("attack", way, behaviour, json.dumps(where), "8", "60") as attacker:
-            assert attacker.stdout.readline() == "begun\n"
+        with flood.attacking(attackers, way, behaviour, where, 8):
             if way in flood.GATEWAYS and behaviour.startswith("half a message"):
                 await_calm(where["pid"])  # 400 MB arrive at first
             beside = flood.times_ms(call, ROW_SECONDS)

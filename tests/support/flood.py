@@ -11,6 +11,7 @@ import hashlib
 import itertools
 import json
 import os
+import signal
 import socket
 import struct
 import subprocess
@@ -680,11 +681,44 @@ def child(*args: str) -> Iterator[subprocess.Popen[str]]:
     finally:
         if process.stdin is not None:
             process.stdin.close()
-        if args[0] == "attack":
-            process.kill()
         process.wait(30)
         if process.stdout is not None:
             process.stdout.close()
+
+
+def serve_attacks() -> None:
+    """Fork a process for each attack that the standard input names, and kill it at the next line.
+
+    A process of its own for each would import for most of a second.
+    """
+    for line in iter(sys.stdin.readline, ""):
+        arguments = json.loads(line)
+        attacker = os.fork()
+        if attacker == 0:
+            attack(*arguments)
+            os._exit(0)
+        sys.stdin.readline()
+        os.kill(attacker, signal.SIGKILL)
+        os.waitpid(attacker, 0)
+        print("ended", flush=True)
+
+
+@contextlib.contextmanager
+def attacking(
+    attackers: subprocess.Popen[str], way: str, part: str, where: Where, connections: int, seconds: float = 60.0
+) -> Iterator[None]:
+    """Attack for the length of the context, by the process that `serve_attacks` runs in."""
+    assert attackers.stdin is not None
+    assert attackers.stdout is not None
+    attackers.stdin.write(json.dumps([way, part, where, connections, seconds]) + "\n")
+    attackers.stdin.flush()
+    assert attackers.stdout.readline() == "begun\n"
+    try:
+        yield
+    finally:
+        attackers.stdin.write("end\n")
+        attackers.stdin.flush()
+        assert attackers.stdout.readline() == "ended\n"
 
 
 IMAGE = np.zeros((224, 224, 3), np.uint8)
@@ -736,4 +770,4 @@ if __name__ == "__main__":
     elif sys.argv[1] == "page":
         serve_page()
     else:
-        attack(sys.argv[2], sys.argv[3], json.loads(sys.argv[4]), int(sys.argv[5]), float(sys.argv[6]))
+        serve_attacks()
