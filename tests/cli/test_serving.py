@@ -159,8 +159,8 @@ def test_a_server_says_its_policy_its_page_and_where_each_kind_of_client_connect
         "  policy: noop (action_dim=7)",
         "  API: https://127.0.0.1:8000/docs",
         "  live page: https://127.0.0.1:8000/live",
-        "  openpi: wss://127.0.0.1:8000/, wss://127.0.0.1:8000/openpi",
         "  gr00t: tcp://0.0.0.0:5556",
+        "  openpi: wss://127.0.0.1:8000/, wss://127.0.0.1:8000/openpi",
         "  vlagents: rpyc://0.0.0.0:8080",
     ]
 

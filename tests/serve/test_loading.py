@@ -175,11 +175,11 @@ def test_a_replica_answers_what_waits_before_its_ways_in_and_its_observers_close
             _tasks=[asyncio.ensure_future(asyncio.sleep(60))],
             _engine=part("engine", draining=True),
             _migrator=SimpleNamespace(hand_over=lambda: ended("sessions"), close=lambda: ended("migrator")),
-            **{f"_{name}": part(name) for name in ("observers", "metrics", "local", "stream")},
+            **{f"_{name}": part(name) for name in ("parts", "observers", "metrics", "local", "stream")},
             _plasma=None,
         )
         await one.close()
         assert await asyncio.gather(*one._tasks, return_exceptions=True)
 
     asyncio.run(close())
-    assert closed == ["sessions", "migrator", "engine", "local", "stream", "observers", "metrics"]
+    assert closed == ["sessions", "migrator", "engine", "local", "stream", "parts", "observers", "metrics"]

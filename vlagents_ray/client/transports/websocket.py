@@ -28,7 +28,7 @@ from websockets.uri import parse_uri
 from vlagents_ray.client.credentials import ANONYMOUS, WEBSOCKET_LOG, Credentials, require_plain, tls_failure
 from vlagents_ray.client.transports.base import FAST_S, SPIN_S, CodecChoice, await_answer, first_timeout_s, left_s, wait
 from vlagents_ray.client.transports.http import HttpTransport, http_url, no_replica, refusal
-from vlagents_ray.errors import ConnectionLost, DeadlineExceeded, MessageTooLarge, PolicyUnavailable
+from vlagents_ray.errors import ConnectionLost, DeadlineExceeded, MessageTooLarge, PolicyUnavailable, UnknownApp
 from vlagents_ray.protocol.frame_layout import Buffer
 from vlagents_ray.protocol.frames import decode_replies, request_parts
 from vlagents_ray.protocol.messages import (
@@ -331,7 +331,7 @@ class WebSocketTransport:
                 return open_websocket(
                     self._url, self._credentials, max(0.1, min(attempt_s, deadline - time.monotonic()))
                 )
-            except PolicyUnavailable as error:
+            except (PolicyUnavailable, UnknownApp) as error:
                 cause = error.__cause__
                 transient = isinstance(cause, InvalidStatus) and cause.response.status_code in _TRANSIENT
                 silent = isinstance(cause, TimeoutError)
