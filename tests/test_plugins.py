@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Callable
 from pathlib import Path
 
@@ -48,6 +49,8 @@ def install(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Install:
         registry._installed_entry_points.cache_clear()
 
     monkeypatch.syspath_prepend(tmp_path)
+    for module in [name for name in sys.modules if name.partition(".")[0] == "lab_policies"]:
+        monkeypatch.delitem(sys.modules, module)  # of another test's folder
     yield write
     registry._installed_entry_points.cache_clear()
 
@@ -98,6 +101,33 @@ def test_a_plugin_that_cannot_be_loaded_is_named_and_hides_no_other(
     [listed] = [row for row in policies_and_wrappers() if row.name == "mine"]
     assert listed.missing is not None
     assert "lab-policies" in listed.missing
+
+
+@pytest.mark.parametrize(
+    ("value", "message"),
+    [
+        ("lab_policies.registry:COMMAND", "command 'lab' of lab-policies cannot be loaded: out of order"),
+        ("lab_policies.broken:COMMAND", "lab-policies to name a RegistryEntry"),
+    ],
+)
+def test_a_command_that_cannot_be_loaded_is_an_error_that_names_its_plugin(
+    install: Install, tmp_path: Path, value: str, message: str
+) -> None:
+    (tmp_path / "lab_policies" / "command.py").write_text("raise ImportError('out of order')\n")
+    with (tmp_path / "lab_policies" / "registry.py").open("a") as file:
+        file.write("COMMAND = RegistryEntry('lab_policies.command:run')\n")
+    install("lab-policies", commands=f"lab = {value}")
+    with pytest.raises(ConfigError, match=message):
+        registry.load_command("lab")
+
+
+def test_a_policy_whose_module_raises_is_listed_with_its_error(install: Install, tmp_path: Path) -> None:
+    (tmp_path / "lab_policies" / "mine.py").write_text("raise RuntimeError('out of order')\n")
+    install("lab-policies", policies="mine = lab_policies.registry:MINE")
+    with pytest.raises(ConfigError, match="policy 'mine' of lab-policies cannot be loaded: out of order"):
+        registry.policy_class("mine")
+    [listed] = [row for row in policies_and_wrappers() if row.name == "mine"]
+    assert "out of order" in str(listed.missing)
 
 
 def test_a_name_of_two_distributions_is_an_error_that_names_both(install: Install) -> None:

@@ -416,7 +416,10 @@ def _is_class(name: str) -> bool:
 
 def registered_class(kind: str, name: str, unknown: type[ConfigError] = ConfigError) -> type[Any]:
     """Return the class registered as `name`, or given as "module:Class"; raises `unknown` if there is none."""
-    target = target_of(kind, name)
+    entry = find_entry(kind, name)
+    if entry is not None and entry.distribution != CORE:
+        _require_importable(kind, name, entry)
+    target = name if entry is None else entry.target
     if ":" not in target:
         distribution = not_installed(kind).get(name)
         if distribution is not None:
@@ -429,6 +432,34 @@ def registered_class(kind: str, name: str, unknown: type[ConfigError] = ConfigEr
             f"{name!r} is not registered: want one of {sorted(known)}, or 'module:Class'{did_you_mean(name, known)}"
         )
     return named_class(target, unknown)
+
+
+def load_command(name: str) -> Any:
+    """Return the function or `typer.Typer` of a command that a plug-in registers.
+
+    Raises:
+        ConfigError: It cannot be loaded, for whatever reason; the message names the plug-in.
+    """
+    entry = find_entry("commands", name)
+    if entry is None:
+        raise ConfigError(f"command {name!r} is not registered: want one of {names('commands')}")
+    _require_importable("commands", name, entry)
+    return load_target(entry.target)
+
+
+def _require_importable(kind: str, name: str, entry: RegistryEntry) -> None:
+    """Raise `ConfigError` if a plug-in's module raises any other error than those of this package.
+
+    Without this, a broken plug-in would end listings, and commands that do not use it.
+    """
+    try:
+        importlib.import_module(entry.target.partition(":")[0])
+    except VLAgentsError:
+        raise
+    except ModuleNotFoundError:
+        return  # `load_target` says what is not installed
+    except Exception as error:
+        raise ConfigError(f"{_SINGULAR[kind]} {name!r} of {entry.distribution} cannot be loaded: {error}") from error
 
 
 def named_class(name: str, unknown: type[ConfigError] = ConfigError) -> type[Any]:

@@ -20,7 +20,7 @@ from vlagents_ray.cli.options import AsJson, Commands
 from vlagents_ray.cli.serve import serve_command
 from vlagents_ray.errors import VLAgentsError
 from vlagents_ray.naming import did_you_mean
-from vlagents_ray.registry import find_entry, load_target, names, not_installed, pip_install
+from vlagents_ray.registry import find_entry, load_command, names, not_installed, pip_install
 
 if TYPE_CHECKING:
     from vlagents_ray.cli.listing import Listed
@@ -126,17 +126,15 @@ def _add_commands_of_plugins() -> None:
     """Add the commands of installed plug-ins; one that cannot be imported fails when it is called."""
     for name in names("commands"):
         try:
-            entry = find_entry("commands", name)
-            if entry is None:
-                continue
-            command = load_target(entry.target)
+            command, entry = load_command(name), find_entry("commands", name)
         except VLAgentsError as error:
             _add_failing(name, "It cannot be loaded.", str(error))
             continue
+        about = "" if entry is None else entry.about
         if isinstance(command, typer.Typer):
-            app.add_typer(command, name=name, short_help=entry.about, rich_help_panel=_MORE)
+            app.add_typer(command, name=name, short_help=about, rich_help_panel=_MORE)
         else:
-            app.command(name, short_help=entry.about, rich_help_panel=_MORE)(command)
+            app.command(name, short_help=about, rich_help_panel=_MORE)(command)
     for name, distribution in not_installed("commands").items():
         cure = pip_install(distribution=distribution)
         message = f"command {name!r} is in {distribution}, which is not installed: {cure}"
