@@ -63,7 +63,7 @@ LOCKS = {  # of the stages that install
     if (found := re.search(r"source=(\S+/locks/[^,]+)", line.flags.get("mount", "")))
 }
 INSTALL = (FOLDER / "install.sh").read_text()
-SIMULATORS = re.findall(r'^(\w+) = \["vlagents-ray\[sim\]"', (ROOT / "pyproject.toml").read_text(), re.MULTILINE)
+SIMULATORS = resolved.simulators()
 FAMILIES = [file.stem for file in resolved.families()]
 MODELS = set(FAMILIES) - set(SIMULATORS) - {"libero_pro", "rcs", "robosuite"}
 

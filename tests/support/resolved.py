@@ -160,15 +160,20 @@ def families() -> list[Path]:
     return sorted(file for file in FAMILIES.glob("*.txt") if "." not in file.stem and file.stem not in WITHOUT_IMAGE)
 
 
+def simulators() -> list[str]:
+    """The extras of simulators that have an image: all but SIMPLER, which is in the image of ManiSkill."""
+    of_core = [extra for extra in EXTRAS if f"{PROJECT['name']}[sim]" in EXTRAS[extra]]
+    of_plugins = []
+    for extra, requirements in OF_PLUGINS.items():
+        extras_of_core = {name for text in requirements for name in Requirement(text).extras}
+        if "sim" in extras_of_core and "maniskill" not in extras_of_core:
+            of_plugins.append(extra)
+    return list(dict.fromkeys([*of_core, *of_plugins]))
+
+
 def locks() -> dict[str, tuple[str, list[str]]]:
     """Of each lock's name the Python and the requirements."""
-    of_core = [extra for extra in EXTRAS if f"{PROJECT['name']}[sim]" in EXTRAS[extra]]
-    of_plugins = []  # simulators, but for SIMPLER, which is in the image of ManiSkill
-    for extra, wanted in OF_PLUGINS.items():
-        needed = {name for text in wanted for name in Requirement(text).extras}
-        if "sim" in needed and "maniskill" not in needed:
-            of_plugins.append(extra)
-    servers = dict.fromkeys(["serve", "sim", *of_core, *of_plugins])
+    servers = ["serve", "sim", *simulators()]
     found = {f"server-{extra}": (SERVER_PYTHON, direct(extra)) for extra in servers}
     for file in families():
         python = re.match(r"# python: (\S+)", file.read_text())
