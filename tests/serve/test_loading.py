@@ -160,6 +160,16 @@ def test_what_other_replicas_call_reaches_the_part_that_has_it(monkeypatch: pyte
     assert given == args
 
 
+def test_other_replicas_call_a_part_by_its_name() -> None:
+    class Parts:
+        async def call(self, part: str, method: str, *args: Any) -> Any:
+            return part, method, args
+
+    one = object.__new__(Bare)
+    vars(one).update(_parts=Parts())
+    assert asyncio.run(one.call_part("counter", "count", 1, "two")) == ("counter", "count", (1, "two"))
+
+
 def test_a_replica_answers_what_waits_before_its_ways_in_and_its_observers_close() -> None:
     closed: list[str] = []
 

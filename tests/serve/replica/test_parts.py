@@ -1,7 +1,11 @@
-"""Parts of a replica that plug-ins add: settings, order of opening and closing, observers, routes, facts."""
+"""Parts of a replica: settings, order of opening and closing, observers, routes, facts, calls between replicas."""
 
 from __future__ import annotations
 
+import asyncio
+import threading
+from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any, ClassVar
 
 import pytest
@@ -9,13 +13,13 @@ from pydantic import ValidationError
 from starlette.responses import PlainTextResponse
 from starlette.routing import Route
 
-from vlagents_ray.errors import ConfigError
+from vlagents_ray.errors import ConfigError, InvalidInput
 from vlagents_ray.policies.noop import Noop
 from vlagents_ray.serve.config.deployment import ServerArgs
 from vlagents_ray.serve.config.parts import PartArgs, PartConfig
 from vlagents_ray.serve.engine.engine import Engine
 from vlagents_ray.serve.engine.observer import Observer
-from vlagents_ray.serve.replica.part import PartContext, ReplicaPart, open_parts
+from vlagents_ray.serve.replica.part import OtherReplica, PartContext, ReplicaPart, ReplicaParts, open_parts
 
 HERE = __name__
 events: list[str] = []
@@ -54,6 +58,38 @@ class Plain(ReplicaPart):
 class Failing(ReplicaPart):
     def open(self) -> None:
         raise ConfigError("failing: no folder")
+
+
+class Totals(ReplicaPart):
+    """Adds up a number of each replica."""
+
+    sibling_methods: ClassVar[dict[str, float | None]] = {"in_thread": 5.0, "on_loop": None, "fail": 5.0}
+
+    def open(self) -> None:
+        self.number = len(self.context.replica)
+
+    def in_thread(self, more: int) -> tuple[int, bool]:
+        return self.number + more, threading.current_thread() is threading.main_thread()
+
+    async def on_loop(self, more: int) -> tuple[int, bool]:
+        return self.number + more, threading.current_thread() is threading.main_thread()
+
+    def fail(self) -> None:
+        raise InvalidInput("no total")
+
+    def secret(self) -> int:
+        return self.number
+
+
+class Neighbour:
+    """Another replica in this process."""
+
+    def __init__(self, name: str, parts: ReplicaParts) -> None:
+        self.name = name
+        self._parts = parts
+
+    async def call_part(self, part: str, method: str, *args: Any, limit_s: float | None) -> Any:
+        return await asyncio.wait_for(self._parts.call(part, method, *args), limit_s)
 
 
 class NoPart:
@@ -116,3 +152,43 @@ def test_a_class_that_is_no_part_and_an_unknown_name_are_errors() -> None:
         ServerArgs(policy="noop", parts={f"{HERE}:NoPart": {}})
     with pytest.raises(ValidationError, match="'latency' is not registered"):
         ServerArgs(policy="noop", parts={"latency": {}})
+
+
+@pytest.fixture
+def totals(context: PartContext) -> Totals:
+    """The part of a replica beside two others, one of which has no such part."""
+    with_part = open_parts(args(Totals={}), replace(context, replica="longer name"))
+    without_part = open_parts(args(), context)
+
+    async def siblings() -> Sequence[OtherReplica]:
+        return [Neighbour("with", with_part), Neighbour("without", without_part)]
+
+    return Totals(None, replace(context, part=f"{HERE}:Totals", siblings=siblings))
+
+
+@pytest.mark.parametrize(("method", "on_loop"), [(Totals.in_thread, False), (Totals.on_loop, True)])
+def test_a_part_calls_the_same_part_of_other_replicas(totals: Totals, method: Any, on_loop: bool) -> None:
+    async def call() -> list[Any]:
+        siblings = await totals.siblings()
+        assert [sibling.name for sibling in siblings] == ["with", "without"]
+        return await asyncio.gather(*(sibling.call(method, 5) for sibling in siblings), return_exceptions=True)
+
+    answer, missing = asyncio.run(call())
+    assert answer == (len("longer name") + 5, on_loop)
+    assert isinstance(missing, LookupError)
+    assert f"part '{HERE}:Totals'" in str(missing)
+
+
+def test_an_error_of_the_part_of_another_replica_is_raised_here(totals: Totals) -> None:
+    async def call() -> Any:
+        return await (await totals.siblings())[0].call(Totals.fail)
+
+    with pytest.raises(InvalidInput, match="no total"):
+        asyncio.run(call())
+
+
+def test_other_replicas_call_only_the_methods_that_a_part_names(context: PartContext) -> None:
+    parts = open_parts(args(Totals={}), context)
+    for method in ("secret", "close", "open", "__init__", "siblings"):
+        with pytest.raises(LookupError, match=f"no method '{method}'"):
+            asyncio.run(parts.call(f"{HERE}:Totals", method))

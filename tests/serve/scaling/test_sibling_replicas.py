@@ -15,7 +15,12 @@ from vlagents_ray.errors import InvalidInput, InvalidWeights, VLAgentsError
 from vlagents_ray.serve.scaling import sibling_replicas
 from vlagents_ray.serve.scaling.rebalancer import ReplicaLoad
 from vlagents_ray.serve.scaling.session_migration import PeerEnded, PeerUnreachable
-from vlagents_ray.serve.scaling.sibling_replicas import PEER_METHODS, ReplicasInCluster, SiblingReplicas
+from vlagents_ray.serve.scaling.sibling_replicas import (
+    PEER_METHODS,
+    ReplicasInCluster,
+    SiblingReplica,
+    SiblingReplicas,
+)
 from vlagents_ray.serve.weights import PushOptions, WeightUpdates
 
 
@@ -40,11 +45,26 @@ def test_errors_of_another_replica(monkeypatch: pytest.MonkeyPatch, error: Excep
         raise error
 
     monkeypatch.setattr(sibling_replicas, "call_replica", call)
-    replica = sibling_replicas._Sibling("r1", "actor", {"r1"})
+    replica = SiblingReplica("r1", "actor", {"r1"})
     with pytest.raises(becomes) as found:
         asyncio.run(replica.weights(WeightUpdates.stage, 1, {}, PushOptions()))
     assert type(found.value) is becomes
     assert str(found.value)
+
+
+def test_a_part_of_another_replica_has_its_own_time_limit(monkeypatch: pytest.MonkeyPatch) -> None:
+    cluster = Cluster(monkeypatch, a="counted", late=None)
+
+    async def call(limit_s: float) -> list[Any]:
+        others = await SiblingReplicas().others()
+        called = [other.call_part("counter", "count", 7, limit_s=limit_s) for other in others]
+        return await asyncio.gather(*called, return_exceptions=True)
+
+    answered, late = asyncio.run(call(0.1))
+    assert answered == "counted"
+    assert isinstance(late, PeerUnreachable)
+    assert "no answer within 0.1 s" in str(late)
+    assert cluster.asked == [("a", "counter"), ("late", "counter")]
 
 
 class Cluster:

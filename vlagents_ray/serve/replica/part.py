@@ -1,4 +1,4 @@
-"""Parts of a replica that plug-ins add: routes of its HTTP server, observers of its requests, facts in its metadata.
+"""Parts of a replica that plug-ins add: routes, observers of requests, facts in the metadata, calls between replicas.
 
 A plug-in registers a class by the entry-point group `vlagents_ray.replica`, and a deployment file turns it on:
 
@@ -7,16 +7,31 @@ A plug-in registers a class by the entry-point group `vlagents_ray.replica`, and
       parts: {latency_log: {folder: runs/latency}}
 
 Routes are behind the server's access control: with API keys on, a caller without a key reaches none of them.
+
+A deployment may have several replicas, each with a part of its own. A part calls the same part of the others by the
+methods that it lists in `sibling_methods`:
+
+    class Counter(ReplicaPart):
+        sibling_methods = {"count": 3.0}
+
+        def count(self) -> int: ...
+
+        async def total(self) -> int:
+            counts = [sibling.call(Counter.count) for sibling in await self.siblings()]
+            return self.count() + sum(await asyncio.gather(*counts))
+
 `examples/plugin` has a complete part.
 """
 
 from __future__ import annotations
 
+import asyncio
+import inspect
 import logging
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Awaitable, Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack
-from dataclasses import dataclass
-from typing import Any, ClassVar
+from dataclasses import dataclass, replace
+from typing import Any, ClassVar, Protocol
 
 from starlette.routing import BaseRoute
 
@@ -28,6 +43,20 @@ from vlagents_ray.serve.engine.observer import Observer
 logger = logging.getLogger(__name__)
 
 
+class OtherReplica(Protocol):
+    """Another replica of the application, `SiblingReplica`, as parts use it."""
+
+    name: str  # unique over time
+
+    async def call_part(self, part: str, method: str, *args: Any, limit_s: float | None) -> Any:
+        """Call a method of a part there; raise `PeerEnded`, `PeerUnreachable` or the method's own `VLAgentsError`."""
+
+
+async def no_siblings() -> Sequence[OtherReplica]:
+    """Return the other replicas of an application that has only one."""
+    return []
+
+
 @dataclass(frozen=True, slots=True)
 class PartContext:
     """What a part may use of its replica."""
@@ -36,6 +65,34 @@ class PartContext:
     replica: str  # name of the replica, unique over time
     node: str  # name of its node
     metadata: Callable[[], Mapping[str, Any]]  # the document of `GET /v1/metadata`
+    part: str = ""  # name of the part, its key in the deployment file
+    siblings: Callable[[], Awaitable[Sequence[OtherReplica]]] = no_siblings  # the application's other replicas
+
+
+class SiblingPart:
+    """The same part of another replica."""
+
+    def __init__(self, replica: OtherReplica, part: str, methods: Mapping[str, float | None]) -> None:
+        """Call the part with the name `part` of a replica; `methods` are its `ReplicaPart.sibling_methods`."""
+        self.name = replica.name  # of the replica, unique over time
+        self._replica = replica
+        self._part = part
+        self._methods = methods
+
+    async def call(self, method: Callable[..., Any], *args: Any) -> Any:
+        """Call a method of the part there with `args`, and return its result.
+
+        Args:
+            method: One of the part's `sibling_methods`, such as `Counter.count`.
+
+        Raises:
+            PeerEnded: The replica has ended.
+            PeerUnreachable: It does not answer in time, has no such part, or the method raised another error than a
+                `VLAgentsError`; the method may or may not have been executed.
+            VLAgentsError: The method raised it.
+        """
+        name = method.__name__
+        return await self._replica.call_part(self._part, name, *args, limit_s=self._methods[name])
 
 
 class ReplicaPart:
@@ -46,6 +103,9 @@ class ReplicaPart:
     """
 
     Config: ClassVar[type[PartConfig]] = PartConfig
+    sibling_methods: ClassVar[Mapping[str, float | None]] = {}
+    """The methods that the same part of other replicas may call, and the time limit of each for an answer, s; None is
+    no limit. A coroutine function runs on the replica's event loop, any other one in a thread."""
 
     def __init__(self, settings: Any, context: PartContext) -> None:
         """Create a part with the `settings` of the deployment file, an instance of its `Config`."""
@@ -70,6 +130,11 @@ class ReplicaPart:
         """Return facts for clients, which the replica's metadata has under `parts` and the name of this part."""
         return {}
 
+    async def siblings(self) -> list[SiblingPart]:
+        """Return this part of each other replica of the application; they may change between two calls."""
+        replicas = await self.context.siblings()
+        return [SiblingPart(replica, self.context.part, self.sibling_methods) for replica in replicas]
+
 
 class ReplicaParts:
     """The open parts of one replica."""
@@ -93,6 +158,20 @@ class ReplicaParts:
                 logger.exception("part %r: its facts are not in the metadata", name)
         return facts
 
+    async def call(self, part: str, method: str, *args: Any) -> Any:
+        """Call one of the `sibling_methods` of a part.
+
+        Raises:
+            LookupError: This replica has no such part, or the part no such method.
+        """
+        opened = self._parts.get(part)
+        if opened is None or method not in opened.sibling_methods:
+            raise LookupError(f"part {part!r}: this replica has no method {method!r} of it for other replicas")
+        call = getattr(opened, method)
+        if inspect.iscoroutinefunction(call):
+            return await call(*args)
+        return await asyncio.to_thread(call, *args)
+
     def close(self) -> None:
         """Close all parts in reverse order."""
         self._opened.close()
@@ -103,7 +182,7 @@ def open_parts(args: PartArgs, context: PartContext) -> ReplicaParts:
     parts: dict[str, ReplicaPart] = {}
     with ExitStack() as opened:
         for name, settings in args.on().items():
-            part: ReplicaPart = registered_class("replica", name)(settings, context)
+            part: ReplicaPart = registered_class("replica", name)(settings, replace(context, part=name))
             part.open()
             opened.callback(part.close)
             observer = part.observer()

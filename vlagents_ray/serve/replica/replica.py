@@ -107,7 +107,8 @@ class PolicyReplica(ClientApi, SiblingApi):
         # The observers.
         node = ray.get_runtime_context().get_node_id()[:8]
         self._observers = open_observers(self._engine, settings, self._peers.own_name, node, self.metadata)
-        self._parts = open_parts(settings.parts, PartContext(self._engine, self._peers.own_name, node, self.metadata))
+        context = PartContext(self._engine, self._peers.own_name, node, self.metadata, siblings=self._peers.others)
+        self._parts = open_parts(settings.parts, context)
         self._fleet = Fleet(self._observers.view, self._peers)
         self._meter = LoadMeter(self._engine.queue)
         self._metrics = Exporter(self._engine, tags_of(settings.policy), self._keys, self._observers.recorder)
@@ -294,6 +295,10 @@ class PolicyReplica(ClientApi, SiblingApi):
         if part is WeightUpdates:
             return await self._weights.weights(call, *args)
         return await asyncio.to_thread(call, self._observers.view, *args)
+
+    async def call_part(self, part: str, method: str, *args: Any) -> Any:
+        """Call a method of a part for the same part of another replica, or for a process of the cluster."""
+        return await self._parts.call(part, method, *args)
 
     # New weights: from learners, and from the replica that coordinates a push.
 

@@ -44,6 +44,9 @@ class SiblingApi(Protocol):
     async def peer(self, method: str, *args: Any) -> Any:
         """Call the method of that name in `PEER_METHODS`, and return its result."""
 
+    async def call_part(self, part: str, method: str, *args: Any) -> Any:
+        """Call a method of a part that its `ReplicaPart.sibling_methods` name, and return its result."""
+
 
 class PeerMethod(NamedTuple):
     """A method that replicas call on each other."""
@@ -76,8 +79,8 @@ PEER_METHODS = {
 """What replicas call at each other, beside `SiblingApi`: moves of sessions, pushes of weights, loads, the live page."""
 
 
-class _Sibling(Peer):
-    """Another replica: for moving sessions, for pushes of weights (`WeightsReplica`), and for the live page."""
+class SiblingReplica(Peer):
+    """Another replica: for moving sessions, for pushes of weights (`WeightsReplica`), and for parts of replicas."""
 
     def __init__(self, name: str, actor: Any, initialized: set[str]) -> None:
         """`initialized` are the names of the replicas that are known to be; one that answers so is added."""
@@ -94,15 +97,22 @@ class _Sibling(Peer):
 
     async def call(self, method: Callable[..., Any], *args: Any) -> Any:
         """Call one of `PEER_METHODS`; raise `PeerEnded`, `PeerUnreachable` or the method's own errors."""
-        limit_s = PEER_METHODS[method.__qualname__].limit_s
+        name = method.__qualname__
+        return await self._ask_actor(PEER_METHODS[name].limit_s, SiblingApi.peer, name, *args)
+
+    async def call_part(self, part: str, method: str, *args: Any, limit_s: float | None) -> Any:
+        """Call a method of a part there, within a time limit; raises what `call` raises."""
+        return await self._ask_actor(limit_s, SiblingApi.call_part, part, method, *args)
+
+    async def _ask_actor(self, limit_s: float | None, method: Callable[..., Any], *args: Any) -> Any:
         try:
             if self.name not in self._initialized:
                 # Serve answers a request to a replica that is not initialized with a traceback in its log.
                 if not await asyncio.wait_for(private.replica_is_initialized(self._actor), _ANSWER_S):
                     raise PeerUnreachable("it is not initialized yet")
                 self._initialized.add(self.name)
-            asked = call_replica(self._actor, SiblingApi.peer, method.__qualname__, *args)
-            return await asyncio.wait_for(asked, limit_s)
+            answer = call_replica(self._actor, method, *args)
+            return await asyncio.wait_for(answer, limit_s)
         except ray.exceptions.ActorDiedError as error:
             raise PeerEnded(str(error)) from error
         except ray.exceptions.RayTaskError as error:  # the replica itself raised it
@@ -123,11 +133,11 @@ class ReplicasInCluster(OtherReplicas):
         self._found = float("-inf")
         self._initialized: set[str] = set()
 
-    async def others(self) -> list[_Sibling]:
+    async def others(self) -> list[SiblingReplica]:
         """Return the replicas."""
         actors = dict(await asyncio.to_thread(lambda: list(self._actors())))
         self._initialized &= actors.keys()  # without those that have ended
-        return [_Sibling(name, actor, self._initialized) for name, actor in actors.items()]
+        return [SiblingReplica(name, actor, self._initialized) for name, actor in actors.items()]
 
     async def views(self) -> dict[str, SnapshotReader]:
         """Return the readers of the replicas' snapshots, by name."""
