@@ -41,7 +41,8 @@ def names_by_trial(config: EvalConfig) -> list[str]:
 def test_what_tells_the_policy_is_nowhere_until_all_are_judged(
     tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
-    told = [*NAMES, *URLS.values(), "step-4711", "fingerprint-of", "digest-of"]  # none can be base64 by chance
+    revealing = [*NAMES, *URLS.values(), "step-4711", "fingerprint-of", "digest-of"]
+    hidden = tmp_path / "out" / "trials.hidden.jsonl"
     looks = 0
 
     def look() -> None:
@@ -49,8 +50,9 @@ def test_what_tells_the_policy_is_nowhere_until_all_are_judged(
         looks += 1
         seen = [output(), "\n".join(person.printed).encode(), caplog.text.encode()]
         for path in tmp_path.rglob("*"):
-            seen += [str(path.relative_to(tmp_path)).encode(), path.read_bytes() if path.is_file() else b""]
-        found = [text for text in told if any(text.encode() in one for one in seen)]
+            visible = path.is_file() and path != hidden
+            seen += [str(path.relative_to(tmp_path)).encode(), path.read_bytes() if visible else b""]
+        found = [text for text in revealing if any(text.encode() in one for one in seen)]
         assert not found, f"before question {looks}"
 
     config = plan(tmp_path / "out", record="all", suite={"episodes": 2})
@@ -60,8 +62,9 @@ def test_what_tells_the_policy_is_nowhere_until_all_are_judged(
     assert looks == 3 * 8, "ready, verdict and note of each trial"
     assert (tmp_path / "out" / "recordings" / "trial0008-1" / "meta" / "info.json").is_file()
     lines = [json.loads(line) for line in (tmp_path / "out" / "trials.jsonl").read_text().splitlines()]
-    assert len({len(line["sealed"]) for line in lines if "sealed" in line}) == 1
-    shown = {"trial", "attempt", "at", "outcome", "earned", "note", "score", "ending", "sealed"}
+    assert hidden.stat().st_mode & 0o777 == 0o600
+    assert len({len(line) for line in hidden.read_bytes().splitlines()}) == 1, "the size of the file tells nothing"
+    shown = {"trial", "attempt", "at", "outcome", "earned", "note", "score", "ending", "hidden"}
     assert [set(line) for line in lines if "outcome" in line] == [shown] * 8
     found = summary.results
     assert found.contenders == list(NAMES), "and then it is told"
@@ -173,7 +176,7 @@ def test_a_lost_connection_is_told_without_the_policy_and_is_no_failure_of_it(
     assert told.strip() == f"played again: it could not be played ({code})"
     [attempt] = [attempt for cell in summary.results.cells for attempt in cell.attempts]
     assert attempt.cause == "policy"
-    assert ".example" in attempt.error, "what was sealed is told at the end"
+    assert ".example" in attempt.error, "what was hidden is told at the end"
     assert summary.total.episodes == 2
 
 
@@ -285,6 +288,50 @@ def test_a_line_that_a_killed_process_left_half_written_is_dropped(tmp_path: Pat
         evaluate_on_robot(again, ScriptedPerson(typed([])), agent_factory=Policies())
     last = json.loads(log.read_text().splitlines()[-1])
     assert (last["trial"], last["again"]) == (2, "the evaluation ended before the verdict")
+
+
+@pytest.mark.parametrize("damage", ["edited", "no JSON", "shortened", "missing"])
+def test_a_hidden_file_that_was_changed_is_refused(tmp_path: Path, damage: str) -> None:
+    config = plan(tmp_path / "out", resume=True)
+    with pytest.raises(TrialsInterrupted):
+        evaluate_on_robot(config, ScriptedPerson(typed(["", "s", ""])), agent_factory=Policies())
+    hidden = tmp_path / "out" / "trials.hidden.jsonl"
+    text = hidden.read_text()
+    if damage == "edited":
+        hidden.write_text(text.replace(NAMES[0], "another").replace(NAMES[1], "another"))
+    elif damage == "no JSON":
+        hidden.write_text(text.replace("}", ")"))
+    elif damage == "shortened":
+        hidden.write_text(text[:-40])
+    else:
+        hidden.unlink()
+    with pytest.raises(ConfigError, match=r"hidden line of trial 1 is missing in .*, or was changed"):
+        evaluate_on_robot(config, ScriptedPerson(judged("s")), agent_factory=Policies())
+
+
+def test_a_hidden_line_that_a_killed_process_left_incomplete_before_its_first_trial_is_dropped(tmp_path: Path) -> None:
+    config = plan(tmp_path / "out", resume=True, suite={"episodes": 1})
+    (tmp_path / "out").mkdir()
+    (tmp_path / "out" / "trials.hidden.jsonl").write_bytes(b'{"config": {"pol')
+    with pytest.raises(TrialsInterrupted):
+        evaluate_on_robot(config, ScriptedPerson(typed(["", "s", ""])), agent_factory=Policies())
+    assert unblind(tmp_path / "out", KEY.decode()).total.episodes == 1
+
+
+def test_a_hidden_line_without_its_line_in_the_log_is_of_no_trial(tmp_path: Path) -> None:
+    """The process can be killed after it has written the one, and before the other."""
+    config = plan(tmp_path / "out", resume=True)
+    with pytest.raises(TrialsInterrupted):
+        evaluate_on_robot(config, ScriptedPerson(typed(["", "s", ""])), agent_factory=Policies())
+    log = tmp_path / "out" / "trials.jsonl"
+    complete = log.read_bytes().splitlines(keepends=True)
+    assert b"outcome" in complete[-1]
+    log.write_bytes(b"".join(complete[:-1]))
+    hidden = tmp_path / "out" / "trials.hidden.jsonl"
+    hidden.write_bytes(hidden.read_bytes() + b'{"result": {"ste')
+    with pytest.raises(TrialsInterrupted, match="after 0 of 8"):
+        evaluate_on_robot(config, ScriptedPerson(typed([])), agent_factory=Policies())
+    assert evaluate_on_robot(config, ScriptedPerson(judged("s")), agent_factory=Policies()).total.episodes == 8
 
 
 @pytest.mark.parametrize(

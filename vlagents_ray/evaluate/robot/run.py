@@ -1,13 +1,12 @@
 """Runs the trials of an evaluation on a robot, and writes the results when all of them have their verdicts.
 
-Until then the log of the trials, `trials.jsonl`, has one line a trial, in place of results.db. Its verdicts are plain
-text; the policy, its checkpoint and its timing are encrypted with the key that draws the order of trials, in parts of
-one length. This prevents the operator from seeing them by accident; the key opens them.
+Until then there are two files in place of results.db. The log, `trials.jsonl`, has a line for each attempt at a
+trial, with its verdict. The policy, its checkpoint and its timing are in `trials.hidden.jsonl`, which the operator does
+not open. A line of the log has the hash of its hidden line, so neither can be changed later without the other.
 """
 
 from __future__ import annotations
 
-import base64
 import contextlib
 import dataclasses
 import fcntl
@@ -18,7 +17,7 @@ import logging
 import os
 import secrets
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -42,9 +41,10 @@ from vlagents_ray.evaluate.workers.rollout import AgentFactory, agents
 from vlagents_ray.registry import require
 from vlagents_ray.robot.loop import Robot, opened, robot_named
 
-LOG, KEY = "trials.jsonl", "trials.key"
-_NONCE = 16  # bytes
-_BLOCK = 16384  # bytes: sealed parts have a multiple of this length, which hides the policy
+LOG = "trials.jsonl"
+HIDDEN = "trials.hidden.jsonl"
+KEY = "trials.key"
+_BLOCK = 16384  # bytes: hidden lines have a multiple of this length, so that the size of the file reveals no policy
 _KILLED = "the evaluation ended before the verdict"
 
 
@@ -56,7 +56,7 @@ class LoggedTrial:
     attempt: int
     at: float  # s since 1970, of its end
     seen: dict[str, Any]  # in plain text: outcome, earned, score, note; or `again`, the reason of a repetition
-    sealed: dict[str, Any]  # the parts that reveal the policy
+    hidden: dict[str, Any]  # what reveals the policy
 
     @property
     def finished(self) -> bool:
@@ -85,21 +85,17 @@ class TrialLog(contextlib.AbstractContextManager["TrialLog"]):
             if resumed and not config.resume:
                 raise ConfigError(f"{config.out}: already has trials; resume them (--resume), or choose another folder")
             self.key = _key(config)
-            self._file = self._path.open("a+b")
-        try:
-            fcntl.flock(self._file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        with contextlib.ExitStack() as files:
+            with storing(config.out):
+                self._log = files.enter_context(_JsonLines(self._path))
+                self._hidden = files.enter_context(_JsonLines(config.out / HIDDEN, mode=0o600))
+            self._log.lock()
             plan = canonical([[cell.fingerprint, *cell.name, cell.planned, cell.suite.seeds] for cell in cells])
             self._read(config, hmac.digest(self.key, plan.encode(), hashlib.sha256).hex())
-        except BaseException as error:
-            self._file.close()
-            if isinstance(error, BlockingIOError):
-                raise ConfigError(
-                    f"{self._path}: another evaluation is writing there; wait for it, or choose another folder"
-                ) from error
-            raise
+            self._files = files.pop_all()
 
     def __exit__(self, *exc: object) -> None:
-        self._file.close()
+        self._files.close()
 
     @property
     def finished(self) -> dict[int, LoggedTrial]:
@@ -113,25 +109,22 @@ class TrialLog(contextlib.AbstractContextManager["TrialLog"]):
         """Record that an attempt begins. If no end follows, the evaluation was killed."""
         self._write({"trial": trial, "attempt": attempt, "begun": time.time()})
 
-    def end(self, trial: int, attempt: int, seen: dict[str, Any], sealed: dict[str, Any]) -> None:
+    def end(self, trial: int, attempt: int, seen: dict[str, Any], hidden: dict[str, Any]) -> None:
         at = time.time()
-        self._write({"trial": trial, "attempt": attempt, "at": at, **seen, "sealed": _seal(self.key, sealed)})
-        self.attempts.append(LoggedTrial(trial, attempt, at, seen, sealed))
+        self._write({"trial": trial, "attempt": attempt, "at": at, **seen}, hidden)
+        self.attempts.append(LoggedTrial(trial, attempt, at, seen, hidden))
 
     def note_unblinded(self) -> None:
         """Record that the results were written before all trials were played."""
         self._write({"unblinded": time.time()})
 
     def _read(self, config: EvalConfig, identity: str) -> None:
-        self._file.seek(0)
-        data = self._file.read()
-        whole = data.rfind(b"\n") + 1  # the process was killed while it wrote an incomplete line
-        self._file.truncate(whole)
-        lines = [json.loads(line) for line in data[:whole].splitlines()]
+        lines = [json.loads(line) for line in self._log.read()]
+        hidden_lines = _by_hash(self.key, self._hidden.read())
         if not lines:
             self.started = time.time()
             plan = {"config": json.loads(config.model_dump_json(exclude_unset=True))}
-            self._write({"plan": identity, "at": self.started, "sealed": _seal(self.key, plan)})
+            self._write({"plan": identity, "at": self.started}, plan)
             return
         if not hmac.compare_digest(lines[0]["plan"], identity):
             raise ConfigError(f"{self._path}: is of another plan, robot or key; take those, or another out folder")
@@ -140,22 +133,63 @@ class TrialLog(contextlib.AbstractContextManager["TrialLog"]):
         for line in lines[1:]:
             if "unblinded" in line:
                 continue
-            place = line.pop("trial"), line.pop("attempt")
+            attempt = line.pop("trial"), line.pop("attempt")
             if "begun" in line:
-                begun.add(place)
+                begun.add(attempt)
                 continue
-            begun.discard(place)
-            self.attempts.append(
-                LoggedTrial(*place, line.pop("at"), sealed=_unseal(self.key, line.pop("sealed")), seen=line)
-            )
-        for place in begun:
-            self.end(*place, {"again": _KILLED, "cause": "operator"}, {})
+            begun.discard(attempt)
+            hidden = hidden_lines.get(line.pop("hidden"))
+            if hidden is None:
+                raise ConfigError(
+                    f"{self._path}: the hidden line of trial {attempt[0]} is missing in {HIDDEN}, or was changed; "
+                    "restore both files from one copy, or choose another out folder"
+                )
+            self.attempts.append(LoggedTrial(*attempt, line.pop("at"), seen=line, hidden=json.loads(hidden)))
+        for attempt in begun:
+            self.end(*attempt, {"again": _KILLED, "cause": "operator"}, {})
 
-    def _write(self, line: dict[str, Any]) -> None:
+    def _write(self, line: dict[str, Any], hidden: dict[str, Any] | None = None) -> None:
         with storing(self._path.parent):
-            self._file.write(canonical(line).encode() + b"\n")
-            self._file.flush()
-            os.fsync(self._file.fileno())
+            if hidden is not None:
+                text = json.dumps(hidden, default=str).encode()
+                text += b" " * (-len(text) % _BLOCK)
+                self._hidden.append(text)  # before the line that has its hash, since the process may be killed
+                line = {**line, "hidden": _hash(self.key, text)}
+            self._log.append(canonical(line).encode())
+
+
+class _JsonLines(contextlib.AbstractContextManager["_JsonLines"]):
+    """A file to which lines are appended."""
+
+    def __init__(self, path: Path, mode: int = 0o666) -> None:
+        self._path = path
+        descriptor = os.open(path, os.O_RDWR | os.O_CREAT | os.O_APPEND, mode)
+        self._file = os.fdopen(descriptor, "a+b")
+
+    def lock(self) -> None:
+        """Raise `ConfigError` if another process holds the file."""
+        try:
+            fcntl.flock(self._file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError as error:
+            raise ConfigError(
+                f"{self._path}: another evaluation is writing there; wait for it, or choose another folder"
+            ) from error
+
+    def read(self) -> list[bytes]:
+        """Return all complete lines, and drop one that a killed process left incomplete."""
+        self._file.seek(0)
+        data = self._file.read()
+        complete = data.rfind(b"\n") + 1
+        self._file.truncate(complete)
+        return data[:complete].splitlines()
+
+    def append(self, line: bytes) -> None:
+        self._file.write(line + b"\n")
+        self._file.flush()
+        os.fsync(self._file.fileno())
+
+    def __exit__(self, *exc: object) -> None:
+        self._file.close()
 
 
 def logged_plan(out: Path, key: str | None) -> EvalConfig:
@@ -164,29 +198,22 @@ def logged_plan(out: Path, key: str | None) -> EvalConfig:
         with (out / LOG).open("rb") as file:
             first = json.loads(file.readline())
         secret = key.encode() if key is not None else (out / KEY).read_bytes().strip()
-        return EvalConfig.model_validate(_unseal(secret, first["sealed"])["config"])
+        hidden_lines = _by_hash(secret, (out / HIDDEN).read_bytes().splitlines())
+        plan = json.loads(hidden_lines[first["hidden"]])
+        return EvalConfig.model_validate(plan["config"])
     except FileNotFoundError as error:
         raise ConfigError(f"{error.filename}: is missing; want the folder of an evaluation on a robot") from error
-    except ValueError as error:
+    except (KeyError, ValueError) as error:
         raise ConfigError(f"{out / LOG}: cannot be read with this key; want the `robot.key` of its plan") from error
 
 
-def _seal(key: bytes, content: dict[str, Any]) -> str:
-    text = json.dumps(content, default=str).encode()
-    text += b" " * (-len(text) % _BLOCK)
-    nonce = secrets.token_bytes(_NONCE)
-    return base64.b64encode(nonce + _crypt(key, nonce, text)).decode()
+def _hash(key: bytes, line: bytes) -> str:
+    return hmac.digest(key, line, hashlib.sha256).hex()
 
 
-def _unseal(key: bytes, text: str) -> dict[str, Any]:
-    data = base64.b64decode(text)
-    return dict(json.loads(_crypt(key, data[:_NONCE], data[_NONCE:])))
-
-
-def _crypt(key: bytes, nonce: bytes, text: bytes) -> bytes:
-    """Encrypt or decrypt with SHAKE-256 of key and nonce as the key stream."""
-    stream = hashlib.shake_256(b"vlagents_ray trials" + key + nonce).digest(len(text))
-    return bytes(a ^ b for a, b in zip(text, stream, strict=True))
+def _by_hash(key: bytes, lines: Iterable[bytes]) -> dict[str, bytes]:
+    """Return hidden lines by the hashes that the log has of them."""
+    return {_hash(key, line): line for line in lines}
 
 
 def _key(config: EvalConfig) -> bytes:
@@ -218,9 +245,9 @@ def evaluate_on_robot(
 ) -> Summary:
     """Play every trial of `config` that has no result yet, and write the results to `config.out`.
 
-    A trial's policy is drawn (`schedule`). Until the last verdict neither the folder nor any output or log names it:
-    verdicts go to `trials.jsonl` (`TrialLog`), and results.db, summary.json and report.html are written at the end, as
-    for a simulation. With `config.stop`, a task ends once all its cells have stopped, since trials of the remaining
+    A trial's policy is drawn (`schedule`). Until the last verdict only the hidden file in the folder names it
+    (`TrialLog`), and no output or log does; results.db, summary.json and report.html are written at the end, as for a
+    simulation. With `config.stop`, a task ends once all its cells have stopped, since trials of the remaining
     ones would reveal their policy.
 
     Args:
@@ -384,8 +411,8 @@ class _RemainingTrials:
             "score": result.episode_return,
             "ending": played.ending,
         }
-        sealed = {"result": dataclasses.asdict(result), "metadata": played.metadata}
-        self._log.end(trial.number, attempt, seen, sealed)
+        hidden = {"result": dataclasses.asdict(result), "metadata": played.metadata}
+        self._log.end(trial.number, attempt, seen, hidden)
         self._count(trial, result)
 
     def _count(self, trial: Trial, result: EpisodeResult) -> None:
@@ -420,9 +447,9 @@ class _RemainingTrials:
             other = self._trials[number - 1].job.cell
             if other.policy.name != cell.policy.name:
                 continue
-            what = changed(logged.sealed["metadata"], played.metadata, swept=cell.step is not None)
+            what = changed(logged.hidden["metadata"], played.metadata, swept=cell.step is not None)
             if what is None and other.contender == cell.contender:
-                before = logged.sealed["result"]
+                before = logged.hidden["result"]
                 what = next((name for name in now if now[name] and before[name] and now[name] != before[name]), None)
             if what is not None:
                 raise ConfigError(
@@ -432,11 +459,11 @@ class _RemainingTrials:
 
 
 def result_of(trial: Trial, logged: LoggedTrial) -> EpisodeResult:
-    sealed = dict(logged.sealed["result"])
-    sealed["key"] = EpisodeKey(**sealed["key"])
-    if sealed["key"] != trial.job.key:
+    fields = dict(logged.hidden["result"])
+    fields["key"] = EpisodeKey(**fields["key"])
+    if fields["key"] != trial.job.key:
         raise ConfigError(f"trial {trial.number}: its result is of another plan; choose another out folder")
-    return EpisodeResult(**sealed)
+    return EpisodeResult(**fields)
 
 
 @contextlib.contextmanager
@@ -469,9 +496,9 @@ def _write_results(config: EvalConfig, planned: Sequence[EvalCase], log: TrialLo
             if not logged.finished:
                 by_operator = logged.seen["cause"] == "operator"
                 again = Failure("operator", "trial_repeated", logged.seen["again"])
-                store.record_attempt(job, again if by_operator else Failure(**logged.sealed), retried=True)
+                store.record_attempt(job, again if by_operator else Failure(**logged.hidden), retried=True)
                 continue
-            if logged.sealed["metadata"]:
-                store.note_policy(trial.job.cell.policy.name, logged.sealed["metadata"])
+            if logged.hidden["metadata"]:
+                store.note_policy(trial.job.cell.policy.name, logged.hidden["metadata"])
             store.record(result_of(trial, logged), logged.attempt, finished=logged.at)
         return conclude(config, store, state)
