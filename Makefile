@@ -29,7 +29,7 @@ SHELL := /bin/bash
 VENV ?= .venv
 TORCH ?= torch==2.13.0
 # Those of plugins/vlagents_ray_NAME that `make setup` installs beside the core.
-PLUGINS ?= arro cluster dialects sims
+PLUGINS ?= arro cluster dialects learn sims
 TORCH_INDEX_URL ?=
 TORCH_CUDA ?=
 PYTHON ?= $(shell for python in python3.11 python3; do \
@@ -137,7 +137,7 @@ verified:
 
 # Each in an environment of its own; Stable-Baselines3 and TorchRL in folders beside the torch of this one. openpi's examples want OPENPI_SRC, and
 # LeRobot 0.6 FAMILIES="lerobot lerobot06".
-PROGRAMS := tests/programs tests/learn tests/integration/test_dialects.py tests/integration/test_gateways.py
+PROGRAMS := tests/programs plugins/vlagents_ray_learn/tests tests/integration/test_dialects.py tests/integration/test_gateways.py
 programs: export STABLE_BASELINES3_SRC := $(CURDIR)/build/stable-baselines3
 programs: export TORCHRL_SRC := $(CURDIR)/build/torchrl
 programs: setup $(patsubst %,$(VENV)-%/.installed,$(filter lerobot%,$(FAMILIES)))

@@ -20,9 +20,9 @@ from vlagents_ray import RemoteAgent
 from vlagents_ray.cli.console import out
 from vlagents_ray.errors import VLAgentsError
 from vlagents_ray.interface import Act, Agent, Obs
-from vlagents_ray.learn import Publisher
 from vlagents_ray.serve.launch.deployment_file import deployment
 from vlagents_ray.serve.launch.server import running_server
+from vlagents_ray_learn import Publisher
 
 _LAYER = 1_000_000  # parameters
 _MOMENTS = 0.05  # s between two samples of the memory

@@ -32,10 +32,10 @@ from vlagents_ray.contract import ActionSpec, Contract
 from vlagents_ray.envs.tabletop import Tabletop
 from vlagents_ray.errors import ConfigError
 from vlagents_ray.interface import Act, Agent, Obs
-from vlagents_ray.learn import RolloutPlan, Rollouts
 from vlagents_ray.registry import policy_class
 from vlagents_ray.serve.launch.deployment_file import deployment
 from vlagents_ray.serve.launch.server import running_server
+from vlagents_ray_learn import RolloutPlan, Rollouts
 
 _POLICIES: dict[str, tuple[str, dict[str, Any]]] = {
     "tiny": ("benchmarks.rollouts:Tiny", {}),

@@ -32,7 +32,6 @@ from vlagents_ray.evaluate.plan.config import ClockConfig
 from vlagents_ray.evaluate.results.statistics import Pairs, difference_interval, holm, wilson
 from vlagents_ray.images.codecs import ImageCodec
 from vlagents_ray.interface import Agent
-from vlagents_ray.learn import Publisher
 from vlagents_ray.naming import plain
 from vlagents_ray.policies.adapters import CONFIG as ADAPTER_CONFIG
 from vlagents_ray.policies.adapters import WEIGHTS as ADAPTER_WEIGHTS
@@ -43,6 +42,7 @@ from vlagents_ray.serve.launch.server import running_server
 from vlagents_ray.serve.ports import free_port
 from vlagents_ray.weights.safetensors import read_values, write_values
 from vlagents_ray_dialects.upstream import Upstream
+from vlagents_ray_learn import Publisher
 
 STANDARD = "eager, in this process"
 APP = "reference"

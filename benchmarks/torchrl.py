@@ -27,7 +27,7 @@ from vlagents_ray.errors import ConfigError
 
 RECIPE = Path("sota-implementations/vla_grpo")
 IMPORT = "from torchrl.weight_update import WeightStrategy\n"  # the last import of its utils.py
-LINE = "from vlagents_ray.learn.torchrl import PolicyServer as ProcessInferenceServer, ServerAddress as MPTransport\n"
+LINE = "from vlagents_ray_learn.torchrl import PolicyServer as ProcessInferenceServer, ServerAddress as MPTransport\n"
 SERVERS = {"TorchRL's server": "", "this server": LINE}
 PYTHON = Path(".venv-torchrl/bin/python")  # made by `make environments FAMILIES=torchrl`
 _FINAL = re.compile(r"Final greedy success rate: (\d\.\d+)")

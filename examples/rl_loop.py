@@ -18,7 +18,7 @@ from own_policy import Servo, offset
 
 from vlagents_ray import join
 from vlagents_ray.evaluate import EvalConfig
-from vlagents_ray.learn import Publisher, RolloutPlan, Rollouts, TrainingEvaluation, arrays
+from vlagents_ray_learn import Publisher, RolloutPlan, Rollouts, TrainingEvaluation, arrays
 
 ENV = "own_env:CraneEnv"
 SPREAD = 0.5  # standard deviation of the explored actions

@@ -23,7 +23,6 @@ import torch
 import typer
 from torch.nn.functional import smooth_l1_loss
 
-from vlagents_ray.open_loop import Names, RecordedDataset
 from vlagents_ray.policies.base.model_inputs import resize_with_pad, state_vector
 from vlagents_ray.policies.reference.checkpoint import (
     CAMERAS,
@@ -41,6 +40,7 @@ from vlagents_ray.policies.reference.network import ReferenceNetwork, read_netwo
 from vlagents_ray.ray_tools.git_state import code_in
 from vlagents_ray.robot.episode import INTERVENTION_COLUMN
 from vlagents_ray.weights.safetensors import write_values
+from vlagents_ray_learn.open_loop.recorded_dataset import Names, RecordedDataset
 
 BATCH = 256  # frames
 DRAWS = 4  # times that a frame's context is used in a step, each with noise of its own: they cost little
@@ -93,8 +93,8 @@ def read(
                 raise typer.BadParameter(f"{data / robot}: was not exported by this project: its info has no contract")
             parts = list(contract.state) if start is None else start.embodiments[robot].state
             corrected = INTERVENTION_COLUMN in dataset.features
-            for play in dataset.plays():
-                [episode] = play.parts
+            for session in dataset.sessions():
+                [episode] = session.episodes
                 begun, total = len(texts), len(texts) + episode.length
                 for step in dataset.steps(episode, Names(), None):
                     if step.frame % every == 0 and (step.intervention or not corrected):

@@ -80,7 +80,7 @@ EXPLAINED = {
     "measured.md": ["serve"],
     "other_clients.md": ["serve"],
     "own_policy.md": ["eval"],
-    "pi0.md": ["replay"],
+    "pi0.md": ["tune"],
     "programs.md": ["robot"],
     "slurm.md": ["serve"],
     "troubleshooting.md": ["eval", "serve"],
@@ -95,13 +95,13 @@ OF_OTHERS = {  # options of sbatch, docker, ray, uv, of LeRobot's and GR00T's pr
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
 def test_an_option_in_a_sentence_is_one_of_a_command_that_the_page_names(page: Path) -> None:
-    """`--episodes` in the text of `replay`, whose option is `--only`, sent readers to an error."""
+    """`--episodes` in the text of `open-loop`, whose option is `--only`, sent readers to an error."""
     explained = [f"vlagents-ray {command}" for command in EXPLAINED.get(page.name, [])]
     assert unknown_options(page.read_text(), explained) == []
 
 
 def test_an_option_that_no_command_of_its_page_has_is_found() -> None:
-    text = "`vlagents-ray replay FOLDER` plays it. `--cameras a=b` maps names, `--only 3` selects"
+    text = "`vlagents-ray open-loop DATASET` sends it. `--cameras a=b` maps names, `--only 3` selects"
     assert unknown_options(text) == ["--cameras"]
 
 

@@ -78,6 +78,7 @@ def test_a_plugin_asks_for_the_package_of_its_own_version() -> None:
         "vlagents_ray_arro",
         "vlagents-ray-cluster",
         "vlagents-ray-dialects",
+        "vlagents-ray-learn",
         "vlagents-ray-sims",
     ]
     assert {project["version"] for project in found} == {ours}

@@ -19,6 +19,8 @@ from vlagents_ray.contract import Contract
 from vlagents_ray.errors import ConfigError, MalformedMessage
 
 INFO = "vlagents_ray"  # key in `info.json`
+TRACE = "trace"  # key in the `info.json` of a server's recordings
+CHUNK, ROWS, SESSION = "chunk", "chunk_rows", "session"  # columns of each frame of a recording
 STATISTICS, BYTES = "vlagents_ray_contract", "mean"  # keys in `stats.json`
 GRIPPER = "gripper"  # as a part of the state: `Obs.gripper`
 _JOINTS = "joints"  # the only part of `observation.state` if nothing else is known

@@ -210,7 +210,6 @@ _EXTRAS: dict[str, tuple[str, ...]] = {
     "record": ("av", "pyarrow"),
     "spacemouse": ("pyspacemouse",),
     "otel": ("opentelemetry",),
-    "torchrl": ("torchrl", "tensordict"),
     **{name: (name,) for name in ("wandb", "trackio", "tensorboard", "rerun")},
 }
 

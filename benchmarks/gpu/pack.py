@@ -15,6 +15,8 @@ import typer
 
 ROOT = Path(__file__).resolve().parents[2]
 PYTHON = "3.12"
+# What `benchmarks.gpu` imports of the repository besides itself; `run.sh` installs their wheels.
+PROJECTS = [str(ROOT / folder) for folder in (".", "plugins/vlagents_ray_cluster", "plugins/vlagents_ray_learn")]
 MOST_MIB = 55.0  # beside the repository's own files, such a folder still fits into an upload of 64 MiB
 PACKAGES = (
     "transformers==5.23.*", "pydantic", "simplejpeg", "websockets", "starlette", "uvicorn", "python-multipart",
@@ -23,7 +25,7 @@ PACKAGES = (
 THERE = ("numpy", "torch", "hf_xet")  # with torch; hf_xet only serves downloads
 PLATFORMS = ("manylinux_2_28", "manylinux_2_27", "manylinux_2_24", "manylinux_2_17", "manylinux2014", "manylinux1")
 FOLDERS = ("vlagents_ray", "benchmarks", "requirements", "pyproject.toml", "tests/conftest.py", "tests/__init__.py",
-           "tests/support", "tests/policies/compilation", "tests/learn")  # fmt: skip
+           "tests/support", "tests/policies/compilation", "plugins/vlagents_ray_learn/tests")  # fmt: skip
 RUN = """#!/bin/bash
 # Measures all that needs a GPU: bash run.sh [OPTIONS of python -m benchmarks.gpu]. The report is in $OUT or build/gpu.
 set -eu
@@ -49,7 +51,7 @@ def main(out: Annotated[Path, typer.Option(help="The folder, which is replaced."
     pip = [sys.executable, "-m", "pip", "--disable-pip-version-check"]
     target = ["--python-version", PYTHON, "--implementation", "cp", *platforms, "--only-binary=:all:"]
     subprocess.run([*pip, "download", "--quiet", *target, "--dest", str(wheels), *PACKAGES], check=True)
-    subprocess.run([*pip, "wheel", "--quiet", "--no-deps", "--wheel-dir", str(wheels), str(ROOT)], check=True)
+    subprocess.run([*pip, "wheel", "--quiet", "--no-deps", "--wheel-dir", str(wheels), *PROJECTS], check=True)
     for wheel in wheels.iterdir():
         if wheel.name.startswith(tuple(f"{name}-" for name in THERE)):
             wheel.unlink()

@@ -36,7 +36,10 @@ from vlagents_ray.serve.python_env.child_start import die_with_parent
 from vlagents_ray_cluster.tune.measured_policy import forget_peak, peak_mib
 
 ROOT = Path(__file__).resolve().parents[2]
-GPU_TESTS = ("tests/policies/compilation/test_cuda_graph.py", "tests/learn/test_one_gpu.py")  # they need no Ray
+GPU_TESTS = (
+    "tests/policies/compilation/test_cuda_graph.py",
+    "plugins/vlagents_ray_learn/tests/test_one_gpu.py",
+)  # they need no Ray
 PUBLISHED = (  # by others, for comparison
     "π0.5 on an H100, 3 cameras, in process: 52.4, 65.1, 91.9, 147.4 ms for 1, 2, 4, 8 rows (SGLang 0.5.23)",
     "the same, by WebSocket: 77 ms for 1 robot, 162 ms for 4 (SGLang 0.5.23)",
@@ -210,9 +213,9 @@ def loading(lab: Lab) -> None:
 
 def pushes(lab: Lab) -> None:
     """Push weights of the model's size to acting sessions: from this process, through the CPU, from another process."""
-    from vlagents_ray.learn.publisher import Publisher
     from vlagents_ray.serve.weights import PushOptions
     from vlagents_ray.weights.trainable import own_copy
+    from vlagents_ray_learn.publisher import Publisher
 
     torch = require("torch")
     with lab.engine() as engine:

@@ -14,7 +14,7 @@ from stable_baselines3 import PPO
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.vec_env import VecEnv, VecMonitor
 
-from vlagents_ray.learn import as_vector_env
+from vlagents_ray_learn import as_vector_env
 
 
 class StableBaselinesEnv(VecEnv):

@@ -31,7 +31,6 @@ from vlagents_ray.cli.console import errors
 from vlagents_ray.cli.ray_session import quiet_ray
 from vlagents_ray.evaluate import EvalConfig, Results, compare
 from vlagents_ray.evaluate.plan.config import Count, Retries, Seed
-from vlagents_ray.learn import Publisher, RolloutPlan, Rollouts, TrainingEvaluation, answers, arrays, log_ratio
 from vlagents_ray.policies.base.model_inputs import state_vector
 from vlagents_ray.policies.flow import logprob_of_chain
 from vlagents_ray.policies.reference import Reference
@@ -49,6 +48,7 @@ from vlagents_ray.serve.launch.deployment_file import deployment, together
 from vlagents_ray.serve.launch.server import running_server
 from vlagents_ray.serve.local_agent import LocalPolicy
 from vlagents_ray.weights.safetensors import write_values
+from vlagents_ray_learn import Publisher, RolloutPlan, Rollouts, TrainingEvaluation, answers, arrays, log_ratio
 
 CHECKPOINT = Path(__file__).parents[2] / "reference" / "checkpoint"
 ENV = ROBOT = "tabletop"

@@ -29,9 +29,9 @@ from vlagents_ray.client import RemoteAgent
 from vlagents_ray.errors import ConfigError, PolicyUnavailable, WeightsLost
 from vlagents_ray.evaluate import EvalConfig, PolicyConfig, SuiteConfig, Summary, print_summary
 from vlagents_ray.evaluate.plan.config import Count, Seed, Tracker
-from vlagents_ray.learn import Publisher, RolloutPlan, Rollouts, TrainingEvaluation, arrays
 from vlagents_ray.serve.launch.deployment_file import deployment, together
 from vlagents_ray.serve.launch.server import running_server
+from vlagents_ray_learn import Publisher, RolloutPlan, Rollouts, TrainingEvaluation, arrays
 
 HERE = str(Path(__file__).parent.absolute())
 ENV = "tabletop/lift"

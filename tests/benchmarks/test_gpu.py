@@ -101,7 +101,7 @@ def test_steps_without_time_are_named(tmp_path: Path) -> None:
 def test_it_runs_without_ray_and_needs_no_torch_to_start() -> None:
     code = (
         "import sys; sys.modules['ray'] = None\n"
-        "import benchmarks.gpu.__main__, vlagents_ray.learn.publisher, vlagents_ray.serve.endpoints.http\n"
+        "import benchmarks.gpu.__main__, vlagents_ray_learn.publisher, vlagents_ray.serve.endpoints.http\n"
         "assert 'torch' not in sys.modules"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)

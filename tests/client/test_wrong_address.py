@@ -16,8 +16,8 @@ from certificates import authority
 
 from vlagents_ray import RemoteAgent
 from vlagents_ray.errors import ConfigError, PolicyUnavailable, UnknownApp, VLAgentsError
-from vlagents_ray.learn import Publisher
 from vlagents_ray.serve.ports import free_port
+from vlagents_ray_learn import Publisher
 
 TIMEOUT_S = 1.0
 

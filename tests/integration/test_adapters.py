@@ -18,8 +18,8 @@ from tests.integration.conftest import serving
 from vlagents_ray import Obs, RemoteAgent
 from vlagents_ray.errors import InvalidWeights, UnknownCheckpoint
 from vlagents_ray.interface import Act
-from vlagents_ray.learn import Publisher
 from vlagents_ray.serve.launch.server import Server
+from vlagents_ray_learn import Publisher
 
 pytestmark = pytest.mark.torch
 

@@ -67,7 +67,7 @@ def test_sessions_of_every_transport_are_recorded_and_replayed_without_error(
     recorded = [pq.read_table(file, columns=["chunk"]).to_pydict()["chunk"] for file in files]
     wanted = [[chunk.ravel().tolist() for chunk in one] for one in chunks.values()]
     assert sorted(recorded) == sorted(wanted)
-    given = ["replay", str(folder), "--policy", POLICY, "--out", str(tmp_path / "out")]
+    given = ["open-loop", str(folder), "--policy", POLICY, "--out", str(tmp_path / "out")]
     done = CliRunner().invoke(app, given)
     assert done.exit_code == 0, done.output
     result = json.loads((tmp_path / "out/open_loop.json").read_text())

@@ -16,8 +16,8 @@ from served_agents import Stochastic
 
 from tests.integration.conftest import serving
 from vlagents_ray.errors import NotOffered
-from vlagents_ray.learn import RolloutPlan, Rollouts, arrays
 from vlagents_ray.serve.launch.server import Server
+from vlagents_ray_learn import RolloutPlan, Rollouts, arrays
 
 GROUPS: dict[str, Any] = {"groups": 4, "want": ["logprob", "value"], "seed": 10}
 

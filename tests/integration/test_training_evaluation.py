@@ -15,8 +15,8 @@ from served_agents import Proportional
 from tests.integration.conftest import serving
 from vlagents_ray.errors import ConfigError
 from vlagents_ray.evaluate import EvalConfig, Summary
-from vlagents_ray.learn import Publisher, TrainingEvaluation
 from vlagents_ray.serve.launch.server import Server
+from vlagents_ray_learn import Publisher, TrainingEvaluation
 
 
 @pytest.fixture(scope="module")

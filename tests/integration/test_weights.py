@@ -13,9 +13,9 @@ from shared_ray import shared_server
 from tests.integration.conftest import deploy, states
 from vlagents_ray import Obs, RemoteAgent
 from vlagents_ray.errors import InvalidWeights, PolicyUnavailable, UnchangedWeights
-from vlagents_ray.learn import Publisher
 from vlagents_ray.serve.launch.deployment_file import Deployment, deployment
 from vlagents_ray.serve.launch.server import Server
+from vlagents_ray_learn import Publisher
 
 TRANSPORTS = ("shm", "plasma", "websocket", "http", "handle")
 

@@ -11,11 +11,11 @@ from shared_ray import shared_server
 
 from tests.integration.test_weights import acts_of
 from vlagents_ray.errors import InvalidWeights
-from vlagents_ray.learn import Publisher
-from vlagents_ray.learn.publisher import AppTarget
 from vlagents_ray.serve.launch.deployment_file import deployment
 from vlagents_ray.weights import shared_values
 from vlagents_ray.weights.shared_values import SharedValues
+from vlagents_ray_learn import Publisher
+from vlagents_ray_learn.publisher import AppTarget
 
 pytestmark = pytest.mark.torch
 

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from vlagents_ray.open_loop import Names, RecordedDataset
+from vlagents_ray_learn.open_loop.recorded_dataset import Names, RecordedDataset
 
 torch = pytest.importorskip("torch")
 pytestmark = pytest.mark.torch
@@ -37,10 +37,10 @@ def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def test_the_expert_takes_over_once_and_solves_each_recorded_episode(data: Path) -> None:
     dataset = RecordedDataset(data / "tabletop")
-    assert dataset.plays()
+    assert dataset.sessions()
     begun = []
-    for play in dataset.plays():
-        steps = list(dataset.steps(play.parts[0], Names(), None))
+    for session in dataset.sessions():
+        steps = list(dataset.steps(session.episodes[0], Names(), None))
         led = [step.intervention for step in steps]
         assert led == sorted(led)
         assert led[-1]
@@ -58,7 +58,9 @@ def test_training_goes_on_from_the_checkpoint_with_the_experts_frames_alone(
     checkpoint, frames = train.read(data, CAMERAS, tmp_path / "images", start=before)
     assert checkpoint == before
     dataset = RecordedDataset(data / "tabletop")
-    led = [step.intervention for play in dataset.plays() for step in dataset.steps(play.parts[0], Names(), None)]
+    led = []
+    for session in dataset.sessions():
+        led += [step.intervention for step in dataset.steps(session.episodes[0], Names(), None)]
     assert np.array_equal(frames.place, np.flatnonzero(led))
     old = train.read_network(before.sizes, start).state_dict()
     new = train.fit(checkpoint, frames, 2, 0, tmp_path / "state.pt", rate=1e-4, start=start).state_dict()

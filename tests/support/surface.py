@@ -29,7 +29,7 @@ MODULES = (
     "vlagents_ray.envs",
     "vlagents_ray.evaluate",
     "vlagents_ray.evaluate.robot",
-    "vlagents_ray.learn",
+    "vlagents_ray_learn",
 )
 
 

@@ -109,7 +109,7 @@ for _command, _name, _line in (
     (results.report_command, "report", "Write the report of an evaluation again."),
     (results.export_command, "export", "Write episodes as JSON, CSV, Parquet or a LeRobotDataset."),
     (results.merge_command, "merge", "Merge results: each episode once, by its key."),
-    (results.replay_command, "replay", "Play an episode or a dataset again, and compare actions."),
+    (results.replay_command, "replay", "Play an episode again, and compare actions."),
     (results.bundle_command, "bundle", "Write an evaluation as one file that others can verify."),
     (results.verify_command, "verify", "Check a bundle, and print what is equal or differs."),
 ):

@@ -2,20 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated, Any
 
 import typer
 
-from vlagents_ray.bounds import MOST_EPISODES, MOST_ROWS
+from vlagents_ray.bounds import MOST_EPISODES
 from vlagents_ray.cli.console import errors, fresh, out, print_json, require_folder_of, table
 from vlagents_ray.cli.options import Address, AsJson, Live, LiveAt, finite, parse_list, parse_settings
 from vlagents_ray.errors import ConfigError
-
-if TYPE_CHECKING:
-    from vlagents_ray.open_loop import ReplayPlan
 
 _TABLES = ("json", "csv", "parquet")  # formats of one file
 Folder = Annotated[Path, typer.Argument(metavar="FOLDER", help="Folder of results.")]
@@ -198,44 +194,16 @@ def verify_command(
 
 
 def replay_command(
-    folder: Annotated[Path, typer.Argument(metavar="FOLDER", help="Folder of results, or a LeRobotDataset.")],
+    folder: Annotated[Path, typer.Argument(metavar="FOLDER", help="Folder of results.")],
     episode: Annotated[
-        str | None, typer.Argument(help="Of results: its key, or ENV#NUMBER: 'tabletop#3'.", show_default=False)
+        str | None, typer.Argument(help="Its key, or ENV#NUMBER: 'tabletop#3'.", show_default=False)
     ] = None,
     policy: Annotated[str | None, typer.Option(help="Name, deployment file, or URL; default: the run's own.")] = None,
     out_dir: Annotated[Path | None, typer.Option("--out", help="Folder of the replay; default: a new one.")] = None,
     address: Address = None,
-    only: Annotated[str | None, typer.Option(help="Of a dataset: episodes, as 0-9,12. Default: all.")] = None,
-    horizon: Annotated[
-        int | None, typer.Option(min=1, max=MOST_ROWS, help="Of a dataset: rows of a chunk that are compared.")
-    ] = None,
-    every: Annotated[
-        int, typer.Option(min=1, max=MOST_EPISODES, help="Of a dataset without answers: each so many-th frame.")
-    ] = 1,
-    at_once: Annotated[int, typer.Option(min=1, max=MOST_ROWS, help="Of a dataset: episodes that share a batch.")] = 8,
-    camera_map: Annotated[str | None, typer.Option(help="Of a dataset: POLICY=DATASET, as base=top.")] = None,
-    state: Annotated[str | None, typer.Option(help="Of a dataset: parts of observation.state in order.")] = None,
 ) -> None:
-    """Play an episode of an evaluation again: exit code 0 if all is the same. Or play a dataset to another policy.
-
-    A dataset is a server's recording, or any LeRobotDataset: the policy's errors by joint and by step of the horizon
-    are printed, and written as JSON.
-    """
+    """Play an episode of an evaluation again, and compare: exit code 0 if all is the same."""
     with errors():
-        if (folder / "meta/info.json").is_file() or any(folder.glob("*/meta/info.json")):
-            if episode is not None:
-                raise ConfigError(f"{folder}: is a dataset, got {episode!r}; want --only, or none of it")
-            if policy is None:
-                raise ConfigError(f"{folder}: is a dataset: want --policy, a name, a deployment file or a URL")
-            from vlagents_ray.open_loop import Names, ReplayPlan
-
-            pairs = [part.partition("=") for part in parse_list(camera_map or "")]
-            if odd := [name for name, equals, _ in pairs if not equals]:
-                raise ConfigError(f"--camera-map: got {odd[0]!r}, want POLICY=DATASET, such as base=top,wrist=left")
-            names = Names({name: camera for name, _, camera in pairs}, None if state is None else parse_list(state))
-            plan = ReplayPlan(None if only is None else parse_episodes(only), horizon, every, at_once, names)
-            replay_dataset(folder, policy, out_dir or fresh(Path("runs/replay")), plan)
-            return
         from vlagents_ray.cli.evaluation import play_one
         from vlagents_ray.evaluate import Results
         from vlagents_ray.evaluate.replay import actions_difference, compare, find
@@ -259,33 +227,3 @@ def replay_command(
         for line in [*(found or [same]), f"replay: {into}"]:
             out.print(line)
     raise typer.Exit(bool(found))
-
-
-def replay_dataset(folder: Path, policy: str, into: Path, plan: ReplayPlan) -> None:
-    """Play a dataset to a policy, print the errors, and write them as JSON."""
-    from vlagents_ray.open_loop import candidate, replay, write_result
-
-    with candidate(policy) as sessions:
-        result = replay(folder, sessions, plan)
-    table = result.to_json()
-    out.print(
-        f"{table['frames']} frames of {table['sessions']} sessions, against the recorded {result.against}: "
-        f"mean absolute error {table['mae']:.4g}, root mean square {table['rmse']:.4g}, largest {table['max']:.4g}"
-    )
-    for one in table["by_joint"]:
-        out.print(f"  {one['joint']}: {one['mae']:.4g}, {one['rmse']:.4g}, {one['max']:.4g}")
-    out.print(f"wrote {write_result(result, policy, into)}")
-
-
-def parse_episodes(text: str) -> Sequence[int]:
-    """Return the numbers in a list such as "0-9,12"; raise `ConfigError` for any other text."""
-    found: list[int] = []
-    for part in parse_list(text):
-        first, dash, last = part.partition("-")
-        if not first.isdecimal() or (dash and not last.isdecimal()):
-            raise ConfigError(f"--only: got {part!r}, want numbers and ranges, such as 0-9,12")
-        numbers = range(int(first), int(last or first) + 1)
-        if not numbers or len(found) + len(numbers) > MOST_EPISODES:
-            raise ConfigError(f"--only: expected up to {MOST_EPISODES} numbers, from low to high, got {part!r}")
-        found += numbers
-    return found

@@ -44,7 +44,7 @@ logger = logging.getLogger(__name__)
 
 
 class Weights(Protocol):
-    """A `vlagents_ray.learn.Publisher`."""
+    """A `vlagents_ray_learn.Publisher`."""
 
     def push(self, named: dict[str, torch.Tensor], *, partial: bool, allow_same: bool) -> int:
         """Push weights to the served policy, and return their version."""

@@ -26,7 +26,7 @@ from tests.families.lerobot import tiny
 from tests.families.lerobot.commands import Server, make_site, run, serving
 from vlagents_ray.contract import differences
 from vlagents_ray.errors import ConfigError, ContractMismatch
-from vlagents_ray.open_loop import Names, RecordedDataset
+from vlagents_ray_learn.open_loop.recorded_dataset import Names, RecordedDataset
 
 TASK = "lift the cup"
 BY_RECORD = pytest.mark.skipif(tiny.NEW, reason="lerobot-record of LeRobot 0.6 takes no policy")
@@ -80,12 +80,12 @@ def test_lerobot_record_records_the_actions_of_the_servers_policy(ended: dict[st
     assert done.status == 0, done.log
     assert done.begun[:2] == [(TASK, 7), (TASK, 8)]
     dataset = RecordedDataset(done.folder / "recorded")
-    plays = dataset.plays()
-    assert len(plays) == 2
+    sessions = dataset.sessions()
+    assert len(sessions) == 2
     images = count(1)
-    for play in plays:
+    for session in sessions:
         chunk = np.zeros((0, 3), np.float32)
-        for step in dataset.steps(play.parts[0], Names(state=["joints", "gripper"]), CONTRACT):
+        for step in dataset.steps(session.episodes[0], Names(state=["joints", "gripper"]), CONTRACT):
             colour = colour_of(next(images))  # of the robot's image, which the video has only nearly
             if step.frame % ROWS == 0:
                 state = np.array([*step.obs.state["joints"], step.obs.gripper], np.float32)

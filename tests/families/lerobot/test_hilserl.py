@@ -28,13 +28,13 @@ from lerobot_policy_vlagents.hilserl import Actor, transitions, write_checkpoint
 from tests.families.lerobot.commands import Server, serving
 from vlagents_ray import ChunkPlayer, Obs, PlayerSettings, RemoteAgent
 from vlagents_ray.errors import ConfigError, InvalidWeights, PolicyUnavailable
-from vlagents_ray.learn import Publisher
 from vlagents_ray.policies.lerobot import LeRobot
 from vlagents_ray.robot import Guard, run_loop
 from vlagents_ray.robot.record import Recorder
 from vlagents_ray.robot.simulated import SimulatedRobot
 from vlagents_ray.serve.engine.engine import Engine
 from vlagents_ray.serve.ports import free_port
+from vlagents_ray_learn import Publisher
 
 STATE, ACTION, HZ, FRAMES = (
     4,

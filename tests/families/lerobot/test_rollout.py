@@ -22,7 +22,7 @@ from lerobot_policy_vlagents.modeling_vlagents import VlagentsPolicy
 from tests.families.lerobot.commands import Server, make_site, run, serving
 from tests.families.lerobot.test_commands import TASK, batch
 from vlagents_ray.errors import ConfigError
-from vlagents_ray.open_loop import Names, RecordedDataset
+from vlagents_ray_learn.open_loop.recorded_dataset import Names, RecordedDataset
 
 HORIZON, CORRECTIONS = 12, 2
 
@@ -111,7 +111,7 @@ def test_dagger_records_the_corrections_and_begins_an_episode_after_each(rollout
     assert policys(done.sent) >= CORRECTIONS * WATCHED
     assert MirrorPolicy.begun[1:] == [(TASK, 5), (TASK, 6)]
     recorded = done.folder / "recorded"
-    episodes = [play.parts[0] for play in RecordedDataset(recorded).plays()]
+    episodes = [session.episodes[0] for session in RecordedDataset(recorded).sessions()]
     names = Names(state=["joints", "gripper"])
     actions = [
         [step.expected[0].tolist() for step in RecordedDataset(recorded).steps(part, names, MirrorPolicy.contract)]

@@ -19,7 +19,6 @@ from shared_readings import check_shared_readings
 from tests.families.pi0 import tiny
 from tests.families.pi0.conftest import BATCHED, WORDS, begun, made, seen
 from vlagents_ray.interface import BEHAVIOUR, DELAY, DISTRIBUTION, LEFTOVER, SAMPLES, WANT, Act, Obs
-from vlagents_ray.learn import Publisher
 from vlagents_ray.policies import pi0
 from vlagents_ray.policies.flow import logprob_of_chain
 from vlagents_ray.policies.pi0 import Pi0
@@ -27,6 +26,7 @@ from vlagents_ray.protocol.messages import Request
 from vlagents_ray.serve.engine.engine import Engine
 from vlagents_ray.serve.python_env.child_agent import Child, ChildAgent
 from vlagents_ray.serve.python_env.child_main import Settings
+from vlagents_ray_learn import Publisher
 
 ROOT = Path(__file__).parents[3]
 ALL = ["logprob", "entropy", "replay"]

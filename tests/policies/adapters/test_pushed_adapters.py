@@ -16,13 +16,13 @@ from in_flight import answered
 from vlagents_ray import Agent, Obs
 from vlagents_ray.errors import InvalidWeights, UnchangedWeights
 from vlagents_ray.interface import Act
-from vlagents_ray.learn import Publisher
 from vlagents_ray.protocol.messages import Request
 from vlagents_ray.serve.engine.engine import Engine
 from vlagents_ray.serve.scaling.weight_push import ThisReplica, WeightPusher
 from vlagents_ray.serve.weights import PushOptions
 from vlagents_ray.weights import trainable
 from vlagents_ray.weights.trainable import fingerprint
+from vlagents_ray_learn import Publisher
 
 pytestmark = pytest.mark.torch
 

@@ -34,7 +34,6 @@ from vlagents_ray.errors import (
     VLAgentsError,
 )
 from vlagents_ray.interface import Act, Agent, Obs
-from vlagents_ray.learn import Publisher, publisher
 from vlagents_ray.protocol.frames import read_error
 from vlagents_ray.protocol.messages import Limits
 from vlagents_ray.serve import weights as versions
@@ -48,6 +47,7 @@ from vlagents_ray.serve.engine.engine import Engine
 from vlagents_ray.serve.scaling.weight_push import ThisReplica, WeightPusher
 from vlagents_ray.serve.weights import PushOptions, PushResult
 from vlagents_ray.weights.safetensors import MESSAGE_BYTES, PART_BYTES, header_of, parts_of, read_header
+from vlagents_ray_learn import Publisher, publisher
 
 LENGTH = 3 * 2**20  # 12 MiB, so that there are several parts
 

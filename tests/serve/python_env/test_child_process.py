@@ -31,7 +31,6 @@ from vlagents_ray.errors import (
     PolicyUnavailable,
     VLAgentsError,
 )
-from vlagents_ray.learn import Publisher
 from vlagents_ray.policies.loading import loading_report
 from vlagents_ray.protocol.messages import Reply, Request
 from vlagents_ray.serve.engine.engine import Engine
@@ -41,6 +40,7 @@ from vlagents_ray.serve.queue.call_limits import CallLimits
 from vlagents_ray.serve.weights import PushOptions
 from vlagents_ray.weights import shared_values
 from vlagents_ray.weights.shared_values import NotShared, shared
+from vlagents_ray_learn import Publisher
 
 SUPPORT = Path(__file__).parents[2] / "support"
 ROOT = Path(__file__).parents[3]

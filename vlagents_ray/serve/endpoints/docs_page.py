@@ -40,7 +40,7 @@ _PATHS = f"""\
 `WS /v1/stream`
     Binary frames; sessions end with the connection. A message that begins with `VLA?` is a probe.
 `WS /v1/weights`, `GET /v1/weights`
-    New weights from a learner, with a key of the scope `weights`; see `vlagents_ray.learn.Publisher`. The versions
+    New weights from a learner, with a key of the scope `weights`; see `vlagents_ray_learn.Publisher`. The versions
     that act.
 `GET /live`
     A page that shows what the sessions do now. With keys, it asks for one with the scope `watch`, and has buttons for

@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 
 from vlagents_ray.contract import ActionSpec, Contract
+from vlagents_ray.dataset_contract import CHUNK, ROWS, SESSION, TRACE
 from vlagents_ray.errors import VLAgentsError
 from vlagents_ray.interface import Obs
 from vlagents_ray.robot.dataset import Dataset
@@ -22,8 +23,6 @@ from vlagents_ray.robot.episode import RobotEpisode
 
 logger = logging.getLogger(__name__)
 
-CHUNK, ROWS, SESSION = "chunk", "chunk_rows", "session"  # columns of each frame
-TRACE = "trace"  # key in `info.json`
 _FRAMES = 2000  # maximum number of frames of an episode, whose numbers are in memory; then another episode begins
 _BYTES = 16 * 2**20  # maximum size of these numbers
 _SESSIONS = 32  # maximum number of sessions that are recorded at once; each has an encoder per camera

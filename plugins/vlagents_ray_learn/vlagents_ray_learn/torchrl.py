@@ -2,7 +2,7 @@
 
 A program that starts TorchRL's `ProcessInferenceServer` with an `MPTransport` uses this server after one more line:
 
-    from vlagents_ray.learn.torchrl import PolicyServer as ProcessInferenceServer, ServerAddress as MPTransport
+    from vlagents_ray_learn.torchrl import PolicyServer as ProcessInferenceServer, ServerAddress as MPTransport
 
 Keys are those of `torchrl.data.vla`: of the image (camera "front"), the state (part "state") and the instruction.
 """
@@ -24,16 +24,17 @@ from vlagents_ray.client.agent import RemoteAgent
 from vlagents_ray.contract import ActionSpec, Contract
 from vlagents_ray.errors import ConfigError
 from vlagents_ray.interface import BEHAVIOUR, POLICY, WANT, Act, Agent, Obs
-from vlagents_ray.learn.columns import REPLAY
 from vlagents_ray.policies.base.model_inputs import camera_images, state_vector
 from vlagents_ray.policies.outcomes import attempt, of_good
 from vlagents_ray.registry import named_class, require
 from vlagents_ray.serve.ports import free_port
 from vlagents_ray.weights.trainable import named_values, set_values
+from vlagents_ray_learn.columns import REPLAY
+from vlagents_ray_learn.optional import optional
 
 torch: Any = require("torch")
-nn: Any = require("tensordict.nn", extra="torchrl")
-vla: Any = require("torchrl.data.vla", extra="torchrl")
+nn: Any = optional("tensordict.nn", "torchrl")
+vla: Any = optional("torchrl.data.vla", "torchrl")
 IMAGE, STATE, TEXT = vla.IMAGE_KEY, vla.STATE_KEY, vla.INSTRUCTION_KEY
 _CAMERA, _PART, _TOKENS, _LEARNED = "front", "state", "tokens", ("logprob", REPLAY)
 
@@ -194,9 +195,9 @@ class PolicyServer:
         # Processes of environments import this module for the client alone, which does without Ray.
         from ray import cloudpickle
 
-        from vlagents_ray.learn.publisher import Publisher
         from vlagents_ray.serve.launch.deployment_file import deployment
         from vlagents_ray.serve.launch.server import running_server
+        from vlagents_ray_learn.publisher import Publisher
 
         with ExitStack() as stack:
             file = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="vlr-torchrl-"))) / "factory"
@@ -229,7 +230,7 @@ def _observation(row: Any) -> Obs:
 
 def _row(obs: Obs, session: TorchRLPolicy) -> tuple[Any, np.random.Generator | None]:
     """Return a session's input for the policy, and the generator of its draw, if any."""
-    row = require("tensordict", extra="torchrl").TensorDict({TEXT: session._words}, [])
+    row = optional("tensordict", "torchrl").TensorDict({TEXT: session._words}, [])
     if IMAGE in session.policy.in_keys:
         row[IMAGE] = torch.from_numpy(camera_images(obs, {_CAMERA: _CAMERA})[_CAMERA].copy()).movedim(-1, 0)
     if STATE in session.policy.in_keys:

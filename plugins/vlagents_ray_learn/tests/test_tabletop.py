@@ -193,14 +193,14 @@ def test_a_folder_takes_one_run(tmp_path: Path, second: dict[str, Any], wrong: s
         RunCheckpoints(LearnPlan(out=tmp_path, **second))
 
 
-EXAMPLES = sorted((Path(__file__).parents[2] / "examples" / "learn").glob("*.yaml"))
+EXAMPLES = sorted((Path(__file__).parents[3] / "examples" / "learn").glob("*.yaml"))
 
 
 @pytest.mark.parametrize("file", EXAMPLES, ids=lambda file: file.stem)
 def test_an_example_is_a_plan_and_ends_with_its_method(file: Path) -> None:
     plan = LearnPlan.model_validate(read_run_file(file, "file of settings", "`methods`"))
     assert plan.methods[-1] == file.stem
-    assert f"examples/learn/{file.name}" in (Path(__file__).parents[2] / "docs/tutorials/learn.md").read_text()
+    assert f"examples/learn/{file.name}" in (Path(__file__).parents[3] / "docs/tutorials/learn.md").read_text()
 
 
 def test_there_is_an_example_of_each_method() -> None:
@@ -377,7 +377,7 @@ LearnRun._collect = held
 @pytest.mark.integration
 def test_runs_of_the_example_end_with_one_table_whatever_is_killed(tmp_path: Path) -> None:
     """Of one, the replica and the workers in the second iteration; the other one itself after the first."""
-    example = yaml.safe_load((Path(__file__).parents[2] / "examples/learn/grpo.yaml").read_text())
+    example = yaml.safe_load((Path(__file__).parents[3] / "examples/learn/grpo.yaml").read_text())
     small = {"iterations": 2, "episodes": 32, "evaluate_every": 1, "held_out": 8}  # with the example's clone
     whole, resumed, pushed, killed = (tmp_path / name for name in ("whole", "resumed", "pushed", "killed"))
     with ray_folder() as folder:

@@ -15,7 +15,7 @@ import pytest
 from eval_fakes import LINE, PYTHONPATH, ToZero, wait_for
 from ray_processes import processes, ray_folder, wait_for_end
 
-from vlagents_ray.learn import RolloutPlan, Rollouts
+from vlagents_ray_learn import RolloutPlan, Rollouts
 
 pytestmark = [pytest.mark.ray, pytest.mark.slow]
 
@@ -25,7 +25,7 @@ import json, sys
 from pathlib import Path
 import pyarrow as pa
 from eval_fakes import LINE, ToZero
-from vlagents_ray.learn import RolloutPlan, Rollouts
+from vlagents_ray_learn import RolloutPlan, Rollouts
 
 folder, episodes, options = Path(sys.argv[1]), int(sys.argv[2]), json.loads(sys.argv[3])
 checkpoint = folder / "position"

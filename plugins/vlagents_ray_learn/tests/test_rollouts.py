@@ -24,7 +24,7 @@ from vlagents_ray.evaluate.workers import rollout
 from vlagents_ray.evaluate.workers.in_process import InProcessWorkers
 from vlagents_ray.evaluate.workers.rollout import Report
 from vlagents_ray.interface import Act, Agent, Obs
-from vlagents_ray.learn import RolloutPlan, Rollouts, arrays, rollouts
+from vlagents_ray_learn import RolloutPlan, Rollouts, arrays, rollouts
 
 
 class Workers(InProcessWorkers):
@@ -123,7 +123,7 @@ import threading
 for name in ("ray", "torch"):
     sys.modules[name] = None  # as if it were not installed
 from eval_fakes import LINE, ToZero
-from vlagents_ray.learn import RolloutPlan, Rollouts
+from vlagents_ray_learn import RolloutPlan, Rollouts
 with Rollouts(RolloutPlan(LINE, ToZero, workers=0)) as rollouts:
     print(rollouts.collect(2).num_rows)
 """

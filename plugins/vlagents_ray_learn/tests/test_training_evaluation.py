@@ -20,8 +20,8 @@ from vlagents_ray.evaluate import EvalConfig, Results, compare, evaluate
 from vlagents_ray.evaluate.episode.records import EpisodeResult
 from vlagents_ray.evaluate.plan.config import PushedWeights
 from vlagents_ray.interface import Act, Agent, Obs
-from vlagents_ray.learn import Publisher, TrainingEvaluation, training_evaluation
 from vlagents_ray.weights.trainable import fingerprint
+from vlagents_ray_learn import Publisher, TrainingEvaluation, training_evaluation
 
 
 @pytest.fixture

@@ -12,10 +12,10 @@ from in_flight import submit
 
 from vlagents_ray.errors import ConfigError, InvalidInput, InvalidWeights, UnchangedWeights
 from vlagents_ray.interface import Act, Agent, Obs
-from vlagents_ray.learn import Publisher
 from vlagents_ray.protocol.messages import Reply, Request
 from vlagents_ray.serve.engine.engine import Engine
 from vlagents_ray.weights.trainable import fingerprint
+from vlagents_ray_learn import Publisher
 
 
 class Linear(Agent):

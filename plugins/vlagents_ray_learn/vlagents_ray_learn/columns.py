@@ -43,10 +43,9 @@ from typing import Any
 import numpy as np
 
 from vlagents_ray.errors import InvalidInput
-from vlagents_ray.registry import require
 from vlagents_ray.weights.trainable import to_numpy
+from vlagents_ray_learn.optional import optional
 
-EXTRA = "learn"  # of the package, with pyarrow and gymnasium
 FINAL = "final."
 REPLAY = "replay"
 
@@ -63,7 +62,7 @@ def arrays(transitions: Any) -> dict[str, np.ndarray]:
     Returns:
         The arrays by name of column. They have a row a step, those of `final.` columns a row an episode.
     """
-    pa: Any = require("pyarrow", extra=EXTRA)
+    pa: Any = optional("pyarrow")
     if isinstance(transitions, pa.Table):
         transitions = transitions.combine_chunks().to_batches()[0]
     return {name: _view(pa, transitions.column(name)) for name in transitions.schema.names}

@@ -27,8 +27,8 @@ from vlagents_ray.evaluate.workers.base import FailedAttempts, Workers, dispatch
 from vlagents_ray.evaluate.workers.in_process import workers_class
 from vlagents_ray.evaluate.workers.rollout import Report, agents
 from vlagents_ray.interface import BEHAVIOUR, WANT, Act, Agent, Obs
-from vlagents_ray.learn.columns import EXTRA, FINAL, REPLAY, at_rows, tensors
-from vlagents_ray.registry import require
+from vlagents_ray_learn.columns import FINAL, REPLAY, at_rows, tensors
+from vlagents_ray_learn.optional import optional
 
 WANTED = ("logprob", "value", "entropy", REPLAY)  # columns that a policy fills
 
@@ -37,12 +37,12 @@ _OTHER_MEMBERS = 2**31  # added to the policy seeds of a group's further members
 
 
 class TransitionRecorder(EpisodeRecorder):
-    """Keeps the transitions of one episode, as `vlagents_ray.learn.columns` describes them."""
+    """Keeps the transitions of one episode, as `vlagents_ray_learn.columns` describes them."""
 
     def __init__(
         self, _config: EvalConfig, _hz: float | None, *, want: Sequence[str] = (), images: bool = True
     ) -> None:
-        self._pa: Any = require("pyarrow", extra=EXTRA)
+        self._pa: Any = optional("pyarrow")
         self._want, self._images = tuple(want), images
         self.request_info: Mapping[str, Any] = {WANT: list(want)} if want else {}
         self._seen: dict[str, _Rows] = {}  # the columns of the observations
@@ -263,7 +263,7 @@ class Rollouts(AbstractContextManager["Rollouts"], Iterator[Any]):
     if some die: a broken attempt is repeated, and has no transitions. So the same seeds and weights give the same
     transitions. The keys are those of an evaluation of these settings.
 
-    A record batch is one whole episode with the columns of `vlagents_ray.learn.columns`. Workers on this node write it
+    A record batch is one whole episode with the columns of `vlagents_ray_learn.columns`. Workers on this node write it
     into Ray's object store once, and numpy maps it from there; keeping it keeps its memory in the store.
     """
 
@@ -275,7 +275,7 @@ class Rollouts(AbstractContextManager["Rollouts"], Iterator[Any]):
             MissingDependency: pyarrow is not installed.
             UnknownEnv: There is no such env.
         """
-        self._pa: Any = require("pyarrow", extra=EXTRA)
+        self._pa: Any = optional("pyarrow")
         config = plan.config()
         require_envs(config)
         self._settings, self._config, self._cells = plan, config, cells(config)

@@ -21,11 +21,11 @@ from vlagents_ray.errors import (
     UnchangedWeights,
 )
 from vlagents_ray.interface import Act, Agent, Obs
-from vlagents_ray.learn import Publisher
 from vlagents_ray.protocol.messages import Reply, Request
 from vlagents_ray.serve.engine.engine import Engine
 from vlagents_ray.weights import trainable
 from vlagents_ray.weights.trainable import portable
+from vlagents_ray_learn import Publisher
 
 
 @pytest.fixture

@@ -13,11 +13,10 @@ from vlagents_ray.errors import ConfigError, InvalidAction, InvalidInput, NotRes
 from vlagents_ray.evaluate.episode.episode import options_of_reset
 from vlagents_ray.evaluate.episode.failures import checked_obs, checked_step, env_side
 from vlagents_ray.interface import Act, Obs
-from vlagents_ray.learn.columns import EXTRA
-from vlagents_ray.registry import require
+from vlagents_ray_learn.optional import optional
 
-gymnasium: Any = require("gymnasium", extra=EXTRA)
-vector: Any = require("gymnasium.vector", extra=EXTRA)
+gymnasium: Any = optional("gymnasium")
+vector: Any = optional("gymnasium.vector")
 
 Observation = Literal["all", "state"]
 Autoreset = Literal["same_step", "next_step", "disabled"]

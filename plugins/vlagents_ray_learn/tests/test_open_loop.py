@@ -1,4 +1,4 @@
-"""Datasets that are played to a policy: the same checkpoint makes no error, another one does."""
+"""Open loop: the checkpoint of a recording makes no error, another one does."""
 
 from __future__ import annotations
 
@@ -19,18 +19,19 @@ from recorded_sessions import Brightness, recorded, seen
 from typer.testing import CliRunner
 
 from vlagents_ray.cli.main import app
-from vlagents_ray.cli.results import parse_episodes
 from vlagents_ray.contract import ActionSpec, Contract, StateSpec
 from vlagents_ray.errors import ConfigError, PolicyFailed
 from vlagents_ray.images import jpeg_png
 from vlagents_ray.images.mp4 import Mp4
 from vlagents_ray.interface import Act, Agent, Obs
-from vlagents_ray.open_loop import Names, RecordedDataset, ReplayPlan, Sessions, candidate, replay
 from vlagents_ray.policies.random import Random
 from vlagents_ray.robot.record import Recorder
 from vlagents_ray.serve.engine.engine import Engine
 from vlagents_ray.serve.local_agent import LocalAgent
 from vlagents_ray.serve.observers import episodes
+from vlagents_ray_learn.open_loop.command import parse_episodes
+from vlagents_ray_learn.open_loop.comparison import OpenLoopPlan, OpenSession, candidate, compare
+from vlagents_ray_learn.open_loop.recorded_dataset import Names, RecordedDataset
 
 
 class Follow(Agent):
@@ -46,7 +47,7 @@ class Follow(Agent):
 
 
 @contextmanager
-def loaded(agent: Agent) -> Iterator[Sessions]:
+def loaded(agent: Agent) -> Iterator[OpenSession]:
     engine = Engine(agent)
     engine.start()
     try:
@@ -74,16 +75,16 @@ def demonstrate(folder: Path, frames: int = 6) -> None:
 
 def test_the_same_checkpoint_makes_no_error(tmp_path: Path) -> None:
     record(tmp_path)
-    with loaded(Brightness()) as sessions:
-        result = replay(tmp_path, sessions, ReplayPlan()).to_json()
+    with loaded(Brightness()) as open_session:
+        result = compare(tmp_path, open_session, OpenLoopPlan()).to_json()
     assert (result["mae"], result["max"], result["frames"], result["sessions"]) == (0.0, 0.0, 12, 3)
     assert result["against"] == "answers"
 
 
 def test_another_checkpoint_makes_an_error_by_joint_and_by_step(tmp_path: Path) -> None:
     record(tmp_path)
-    with loaded(Brightness(gain=1.5, chunk=3)) as sessions:
-        result = replay(tmp_path, sessions, ReplayPlan(at_once=2)).to_json()
+    with loaded(Brightness(gain=1.5, chunk=3)) as open_session:
+        result = compare(tmp_path, open_session, OpenLoopPlan(at_once=2)).to_json()
     assert len(result["by_step"]) == 3, "as many rows as both have"
     assert [one["frames"] for one in result["by_step"]] == [12] * 3
     assert result["by_joint"][1]["joint"] == "action_1"
@@ -93,17 +94,17 @@ def test_another_checkpoint_makes_an_error_by_joint_and_by_step(tmp_path: Path) 
 
 def test_noise_of_the_same_seeds_makes_no_error_and_of_others_it_does(tmp_path: Path) -> None:
     record(tmp_path, Random.from_config({"action_dim": 2}))
-    with loaded(Random.from_config({"action_dim": 2})) as sessions:
-        assert replay(tmp_path, sessions, ReplayPlan()).to_json()["max"] == 0
-    with loaded(Random.from_config({"action_dim": 2, "seed": 1})) as sessions:
-        assert replay(tmp_path, sessions, ReplayPlan()).to_json()["max"] > 0
+    with loaded(Random.from_config({"action_dim": 2})) as open_session:
+        assert compare(tmp_path, open_session, OpenLoopPlan()).to_json()["max"] == 0
+    with loaded(Random.from_config({"action_dim": 2, "seed": 1})) as open_session:
+        assert compare(tmp_path, open_session, OpenLoopPlan()).to_json()["max"] > 0
 
 
 def test_a_session_of_several_episodes_is_reset_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(episodes, "_FRAMES", 3)
     record(tmp_path)
-    with loaded(Brightness()) as sessions:
-        result = replay(tmp_path, sessions, ReplayPlan()).to_json()
+    with loaded(Brightness()) as open_session:
+        result = compare(tmp_path, open_session, OpenLoopPlan()).to_json()
     assert (result["max"], len(result["by_episode"]), result["sessions"]) == (0.0, 6, 3)
 
 
@@ -115,22 +116,22 @@ def test_missing_acts_are_told(tmp_path: Path) -> None:
         robot.act(seen(1))
         server.recorder._held_bytes = held
         robot.act(seen(2))
-    with loaded(Brightness()) as sessions:
-        assert replay(tmp_path, sessions, ReplayPlan()).to_json()["missing_acts"] == 1
+    with loaded(Brightness()) as open_session:
+        assert compare(tmp_path, open_session, OpenLoopPlan()).to_json()["missing_acts"] == 1
 
 
 def test_the_actions_of_a_dataset_without_answers_are_those_of_the_frames_ahead(tmp_path: Path) -> None:
     demonstrate(tmp_path)
-    with loaded(Follow()) as sessions:
-        result = replay(tmp_path, sessions, ReplayPlan()).to_json()
+    with loaded(Follow()) as open_session:
+        result = compare(tmp_path, open_session, OpenLoopPlan()).to_json()
     assert (result["against"], result["frames"], result["max"]) == ("actions", 12, 0.0)
     assert [one["frames"] for one in result["by_step"]] == [12, 10, 8], "to the end of each episode"
 
 
 def test_every_nth_frame_of_some_episodes_and_a_shorter_horizon(tmp_path: Path) -> None:
     demonstrate(tmp_path)
-    with loaded(Follow()) as sessions:
-        result = replay(tmp_path, sessions, ReplayPlan([1], horizon=2, every=4)).to_json()
+    with loaded(Follow()) as open_session:
+        result = compare(tmp_path, open_session, OpenLoopPlan([1], horizon=2, every=4)).to_json()
     assert [one["frames"] for one in result["by_step"]] == [2, 2]
     assert [one["episode"] for one in result["by_episode"]] == [1]
 
@@ -166,17 +167,17 @@ def test_a_public_dataset_of_the_older_version_with_other_names(tmp_path: Path) 
     }
     (tmp_path / "meta/info.json").write_text(json.dumps(info))
     (tmp_path / "meta/episodes.jsonl").write_text('{"episode_index": 0, "tasks": ["count"], "length": 4}\n')
-    with loaded(Follow()) as sessions:
-        result = replay(tmp_path, sessions, ReplayPlan()).to_json()
+    with loaded(Follow()) as open_session:
+        result = compare(tmp_path, open_session, OpenLoopPlan()).to_json()
     assert (result["max"], result["by_joint"][1]["joint"]) == (0.0, "elbow")
     dataset = RecordedDataset(tmp_path)
-    [play] = dataset.plays()
-    steps = list(dataset.steps(play.parts[0], Names({"base": "top", "wrist": "side"}), None))
+    [session] = dataset.sessions()
+    steps = list(dataset.steps(session.episodes[0], Names({"base": "top", "wrist": "side"}), None))
     np.testing.assert_array_equal(steps[3].obs.cameras["base"], image)
     assert abs(float(steps[3].obs.cameras["wrist"].mean()) - 100) < 3
     assert steps[3].obs.state["joints"].tolist() == [3, 6, 0.5]
     with pytest.raises(ConfigError, match="tip"):
-        next(dataset.steps(play.parts[0], Names({"base": "tip"}), None))
+        next(dataset.steps(session.episodes[0], Names({"base": "tip"}), None))
 
 
 def test_a_state_that_cannot_be_divided_names_the_option(tmp_path: Path) -> None:
@@ -185,15 +186,15 @@ def test_a_state_that_cannot_be_divided_names_the_option(tmp_path: Path) -> None
     del info["vlagents_ray"]
     (tmp_path / "meta/info.json").write_text(json.dumps(info))
     dataset = RecordedDataset(tmp_path)
-    steps = dataset.steps(dataset.plays()[0].parts[0], Names(state=["arm", "hand"]), None)
+    steps = dataset.steps(dataset.sessions()[0].episodes[0], Names(state=["arm", "hand"]), None)
     with pytest.raises(ConfigError, match="--state"):
         next(steps)
 
 
 def test_a_policy_of_another_robot_is_refused(tmp_path: Path) -> None:
     demonstrate(tmp_path)
-    with loaded(Random.from_config({"action_dim": 7})) as sessions, pytest.raises(ConfigError, match="7"):
-        replay(tmp_path, sessions, ReplayPlan())
+    with loaded(Random.from_config({"action_dim": 7})) as open_session, pytest.raises(ConfigError, match="7"):
+        compare(tmp_path, open_session, OpenLoopPlan())
 
 
 def test_an_error_of_the_policy_says_where(tmp_path: Path) -> None:
@@ -204,14 +205,14 @@ def test_an_error_of_the_policy_says_where(tmp_path: Path) -> None:
             return super().act(obs)
 
     demonstrate(tmp_path)
-    with loaded(Fails()) as sessions, pytest.raises(PolicyFailed, match="episode 0, frame 3"):
-        replay(tmp_path, sessions, ReplayPlan(at_once=1))
+    with loaded(Fails()) as open_session, pytest.raises(PolicyFailed, match="episode 0, frame 3"):
+        compare(tmp_path, open_session, OpenLoopPlan(at_once=1))
 
 
 def test_a_server_at_a_url_is_asked_in_the_same_way(tmp_path: Path) -> None:
     record(tmp_path)
-    with live_server(Brightness()) as server, candidate(server.url) as sessions:
-        result = replay(tmp_path, sessions, ReplayPlan(at_once=2)).to_json()
+    with live_server(Brightness()) as server, candidate(server.url) as open_session:
+        result = compare(tmp_path, open_session, OpenLoopPlan(at_once=2)).to_json()
     assert (result["max"], result["frames"]) == (0.0, 12)
 
 
@@ -219,7 +220,7 @@ def test_the_command_prints_and_writes_the_errors(tmp_path: Path) -> None:
     demonstrate(tmp_path / "data")
     out = tmp_path / "report"
     done = CliRunner().invoke(
-        app, ["replay", str(tmp_path / "data"), "--policy", policy_file(tmp_path), "--out", str(out)]
+        app, ["open-loop", str(tmp_path / "data"), "--policy", policy_file(tmp_path), "--out", str(out)]
     )
     assert done.exit_code == 0, done.output
     assert "mean absolute error 5.25" in done.output
@@ -240,7 +241,6 @@ def policy_file(folder: Path) -> str:
     ("words", "said"),
     [
         (["DATA"], "--policy"),
-        (["DATA", "tabletop#3"], "--only"),
         (["DATA", "--policy", "noop", "--only", "3-"], "--only"),
         (["DATA", "--policy", "noop", "--only", "7"], "episodes"),
         (["DATA", "--policy", "noop", "--camera-map", "base"], "--camera-map"),
@@ -249,7 +249,7 @@ def policy_file(folder: Path) -> str:
 def test_wrong_options_are_told(words: list[str], said: str, tmp_path: Path) -> None:
     demonstrate(tmp_path / "data", 2)
     given = [str(tmp_path / "data") if word == "DATA" else word for word in words]
-    done = CliRunner().invoke(app, ["replay", *given, "--out", str(tmp_path / "out")])
+    done = CliRunner().invoke(app, ["open-loop", *given, "--out", str(tmp_path / "out")])
     assert done.exit_code == 2
     assert said in done.output
 
@@ -259,8 +259,8 @@ def test_numbers_and_ranges() -> None:
 
 
 def test_a_folder_without_a_dataset(tmp_path: Path) -> None:
-    with loaded(Follow()) as sessions, pytest.raises(ConfigError, match="LeRobotDataset"):
-        replay(tmp_path, sessions, ReplayPlan())
+    with loaded(Follow()) as open_session, pytest.raises(ConfigError, match="LeRobotDataset"):
+        compare(tmp_path, open_session, OpenLoopPlan())
 
 
 def test_datasets_of_other_actions_are_not_mixed(tmp_path: Path) -> None:
@@ -268,5 +268,5 @@ def test_datasets_of_other_actions_are_not_mixed(tmp_path: Path) -> None:
     record(tmp_path / "two")
     shutil.move(next((tmp_path / "two").iterdir()), tmp_path / "three")
     (tmp_path / "two").rmdir()
-    with loaded(Follow()) as sessions, pytest.raises(ConfigError, match="one by one"):
-        replay(tmp_path, sessions, ReplayPlan())
+    with loaded(Follow()) as open_session, pytest.raises(ConfigError, match="one by one"):
+        compare(tmp_path, open_session, OpenLoopPlan())

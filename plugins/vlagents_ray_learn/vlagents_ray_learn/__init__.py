@@ -1,6 +1,6 @@
 """Learning with served policies: new weights, evaluations while they are trained, transitions, vector environments.
 
-All but `Publisher`, `TrainingEvaluation` and `log_ratio` needs the extra "learn" (pyarrow, gymnasium). Modules are
+All but `Publisher`, `TrainingEvaluation` and `log_ratio` needs the extra "rollouts" (pyarrow, gymnasium). Modules are
 loaded when their names are first used.
 """
 
@@ -10,11 +10,11 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from vlagents_ray.learn.columns import LogRatio, answers, arrays, log_ratio
-    from vlagents_ray.learn.publisher import Publisher
-    from vlagents_ray.learn.rollouts import RolloutPlan, Rollouts, RolloutStats
-    from vlagents_ray.learn.training_evaluation import TrainingEvaluation
-    from vlagents_ray.learn.vector_env import BatchVectorEnv, as_vector_env
+    from vlagents_ray_learn.columns import LogRatio, answers, arrays, log_ratio
+    from vlagents_ray_learn.publisher import Publisher
+    from vlagents_ray_learn.rollouts import RolloutPlan, Rollouts, RolloutStats
+    from vlagents_ray_learn.training_evaluation import TrainingEvaluation
+    from vlagents_ray_learn.vector_env import BatchVectorEnv, as_vector_env
 
 _LATE = {
     "columns": ("LogRatio", "answers", "arrays", "log_ratio"),

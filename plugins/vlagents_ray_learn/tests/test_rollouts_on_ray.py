@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 from eval_fakes import LINE, PYTHONPATH, ToZero, wait_for
 
-from vlagents_ray.learn import RolloutPlan, Rollouts, arrays
+from vlagents_ray_learn import RolloutPlan, Rollouts, arrays
 
 pytestmark = [pytest.mark.ray, pytest.mark.usefixtures("shared_ray")]
 

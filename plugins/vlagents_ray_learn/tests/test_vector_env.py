@@ -21,8 +21,8 @@ from vlagents_ray.contract import CameraSpec, Contract
 from vlagents_ray.envs.base import SequentialBatch
 from vlagents_ray.errors import ConfigError, EnvFailed, InvalidAction, InvalidInput, MissingDependency, NotReset
 from vlagents_ray.interface import Act, Obs
-from vlagents_ray.learn import as_vector_env
-from vlagents_ray.learn.vector_env import BatchVectorEnv, observation_space
+from vlagents_ray_learn import as_vector_env
+from vlagents_ray_learn.vector_env import BatchVectorEnv, observation_space
 
 TABLETOP: dict[str, Any] = {"env_options": {"width": 32, "height": 32, "max_steps": 6}}
 
@@ -288,13 +288,13 @@ def test_maniskill_on_the_cpu() -> None:
 
 
 def test_without_gymnasium_the_error_names_the_extra(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.delitem(sys.modules, "vlagents_ray.learn.vector_env")
+    monkeypatch.delitem(sys.modules, "vlagents_ray_learn.vector_env")
     monkeypatch.setitem(sys.modules, "gymnasium", None)
-    with pytest.raises(MissingDependency, match=r"vlagents-ray\[learn\]"):
-        __import__("importlib").import_module("vlagents_ray.learn.vector_env")
+    with pytest.raises(MissingDependency, match=r"vlagents-ray-learn\[rollouts\]"):
+        __import__("importlib").import_module("vlagents_ray_learn.vector_env")
 
 
-ROOT = Path(__file__).parents[2]
+ROOT = Path(__file__).parents[3]
 SOURCE = "STABLE_BASELINES3_SRC"  # a checkout, or a folder of `pip install --target`
 
 
@@ -316,7 +316,7 @@ OF_TORCHRL = """
 import sys
 from torchrl.envs import GymWrapper
 from torchrl.envs.utils import check_env_specs
-from vlagents_ray.learn import as_vector_env
+from vlagents_ray_learn import as_vector_env
 options = {"width": 32, "height": 32, "max_steps": 6}
 envs = as_vector_env("tabletop/lift", 2, observation=sys.argv[1], autoreset="disabled", env_options=options)
 env = GymWrapper(envs)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from vlagents_ray.errors import InvalidInput
-from vlagents_ray.learn import log_ratio
+from vlagents_ray_learn import log_ratio
 
 
 def test_an_act_is_a_row_whose_numbers_are_summed() -> None:

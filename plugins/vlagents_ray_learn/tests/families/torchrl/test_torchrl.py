@@ -23,9 +23,9 @@ from torchrl.modules.vla import TinyVLA
 
 from vlagents_ray import Act, Obs
 from vlagents_ray.errors import ConfigError, MissingCamera
-from vlagents_ray.learn.torchrl import PolicyServer, ServedPolicy, ServerAddress, TorchRLPolicy
+from vlagents_ray_learn.torchrl import PolicyServer, ServedPolicy, ServerAddress, TorchRLPolicy
 
-PAGE = Path(__file__).parents[3] / "docs/evaluation/torchrl.md"
+PAGE = Path(__file__).parents[5] / "docs/evaluation/torchrl.md"
 pytestmark = [pytest.mark.torch, pytest.mark.ray, pytest.mark.server]
 WORDS = ("push the block", "lift the block", "push the block")
 TOKENS, LOG_PROBS = ("vla_action", "tokens"), ("vla_action", "log_probs")

@@ -10,7 +10,7 @@ import pytest
 
 from benchmarks.torchrl import LINE, play, prepare
 
-PAGE = Path(__file__).parents[3] / "docs/evaluation/torchrl.md"
+PAGE = Path(__file__).parents[5] / "docs/evaluation/torchrl.md"
 
 
 @pytest.mark.torch

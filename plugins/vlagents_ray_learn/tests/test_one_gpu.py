@@ -16,12 +16,12 @@ from replica_process import ReplicaProcess, model
 from shared_cpu_memory import GPU, ReaderCounts, SharedCpuMemory
 
 from vlagents_ray.errors import InvalidWeights, UnchangedWeights
-from vlagents_ray.learn.publisher import AppTarget
 from vlagents_ray.serve.scaling.weight_push import WeightPusher
 from vlagents_ray.serve.weights import PushOptions, WeightUpdates
 from vlagents_ray.weights import shared_values
 from vlagents_ray.weights.shared_values import NotShared, SharedValues, opened, readable_gpus, shared
 from vlagents_ray.weights.trainable import portable
+from vlagents_ray_learn.publisher import AppTarget
 
 pytestmark = pytest.mark.torch
 

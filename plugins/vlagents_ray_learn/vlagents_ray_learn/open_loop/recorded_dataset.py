@@ -1,0 +1,289 @@
+"""Reading LeRobotDatasets v2.0 to v3.0: recordings of servers and robots, and public datasets."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from vlagents_ray.contract import Contract
+from vlagents_ray.dataset_contract import (
+    CHUNK,
+    INFO,
+    ROWS,
+    SESSION,
+    TRACE,
+    DatasetContract,
+    divided_state,
+    state_parts,
+)
+from vlagents_ray.errors import ConfigError
+from vlagents_ray.images import jpeg_png
+from vlagents_ray.images.mp4 import rgb_converter
+from vlagents_ray.interface import CAPTURED, Obs
+from vlagents_ray.naming import did_you_mean
+from vlagents_ray.protocol.messages import DEFAULT_LIMITS, Budget
+from vlagents_ray.protocol.values import from_text
+from vlagents_ray.registry import require
+from vlagents_ray.robot.episode import ACTION, ENVIRONMENT, IMAGES, INTERVENTION_COLUMN, SAFE_COLUMN, STATE
+
+_IMAGE_DTYPES = ("video", "image")
+
+
+@dataclass(frozen=True, slots=True)
+class Names:
+    """The policy's names for the cameras and state of a dataset without a contract of ours."""
+
+    cameras: Mapping[str, str] = field(default_factory=dict)  # policy's camera -> camera or feature of the dataset
+    state: Sequence[str] | None = None  # concatenated parts of `observation.state`; "gripper" is `Obs.gripper`
+
+
+@dataclass(frozen=True, slots=True)
+class RecordedStep:
+    """A frame of an episode."""
+
+    frame: int
+    obs: Obs
+    expected: np.ndarray  # (H, D): the recorded answer, or the actions from here to the end of the episode
+    intervention: bool = False  # whether the recorded action is an operator's
+
+
+@dataclass(frozen=True, slots=True)
+class RecordedEpisode:
+    """An episode of a dataset."""
+
+    dataset: RecordedDataset
+    index: int
+    length: int
+    instruction: str
+    metadata: Mapping[str, Any]  # its row in `meta/episodes`
+
+
+@dataclass(frozen=True, slots=True)
+class RecordedSession:
+    """The episodes of one session in order; in a public dataset, a single episode."""
+
+    episodes: tuple[RecordedEpisode, ...]
+    options: Mapping[str, Any]  # of the reset
+
+
+class RecordedDataset:
+    """A dataset that is only read."""
+
+    def __init__(self, root: Path) -> None:
+        """Open a dataset; raises `ConfigError` if it cannot be read."""
+        self.root = root
+        self._pq: Any = require("pyarrow.parquet")
+        self._av: Any = require("av")
+        self.info: dict[str, Any] = json.loads((root / "meta/info.json").read_text())
+        self.version = str(self.info.get("codebase_version"))
+        if not self.version.startswith(("v3.", "v2.")):
+            raise ConfigError(f"{root}: expected a LeRobotDataset v3.0, v2.1 or v2.0, got {self.version}; convert it")
+        self.features: dict[str, Any] = self.info["features"]
+        if ACTION not in self.features:
+            raise ConfigError(f"{root}: expected {ACTION!r} among its features, got {sorted(self.features)}")
+        contract = self.info.get(INFO)
+        self.contract = None if contract is None else DatasetContract.from_json(contract)
+        self.traced = TRACE in self.info and CHUNK in self.features
+
+    @property
+    def joints(self) -> list[str]:
+        """The names of the numbers of an action."""
+        names = self.features[ACTION].get("names")
+        if isinstance(names, Mapping):  # {"motors": [...]}
+            names = [name for group in names.values() for name in group]
+        [dim] = self.features[ACTION]["shape"]
+        if names and len(names) == dim:
+            return [str(name) for name in names]
+        return [f"{ACTION}_{i}" for i in range(dim)]
+
+    def sessions(self, chosen: Sequence[int] | None = None) -> list[RecordedSession]:
+        """Return the sessions of the dataset.
+
+        Args:
+            chosen: The indices of their episodes; None: all.
+
+        Raises:
+            ConfigError: A chosen episode does not exist.
+        """
+        episodes = self._episodes()
+        if chosen is not None:
+            missing = sorted(set(chosen) - {episode.index for episode in episodes})
+            if missing:
+                raise ConfigError(f"{self.root}: expected some of its {len(episodes)} episodes, got {missing}")
+            episodes = [episode for episode in episodes if episode.index in set(chosen)]
+        if not self.traced:
+            return [RecordedSession((episode,), {}) for episode in episodes]
+
+        by_session: dict[int, list[RecordedEpisode]] = {}
+        options: dict[int, str] = {}  # of the session's first reset
+        for episode in episodes:
+            columns = self._columns(episode, [SESSION, "reset"])
+            session = columns[SESSION][0]
+            by_session.setdefault(session, []).append(episode)
+            options.setdefault(session, columns["reset"][0])
+        return [
+            RecordedSession(tuple(in_order), _read_values(options[session])) for session, in_order in by_session.items()
+        ]
+
+    def gaps(self, episode: RecordedEpisode) -> int:
+        """Return the number of calls that are missing within a traced episode."""
+        if not self.traced:
+            return 0
+        ticks = np.array(self._columns(episode, ["tick"])["tick"])
+        return int((np.diff(ticks) - 1).clip(0).sum())
+
+    def steps(self, episode: RecordedEpisode, names: Names, policy: Contract | None) -> Iterator[RecordedStep]:
+        """Yield the frames of an episode, with the input names of a policy.
+
+        Args:
+            episode: One of this dataset.
+            names: The policy's names, where the dataset has no contract.
+            policy: The contract of the policy, which divides a state without names; None if it has none.
+
+        Raises:
+            ConfigError: A name is unknown, or a file is incomplete.
+        """
+        image_features = [name for name, feature in self.features.items() if feature["dtype"] in _IMAGE_DTYPES]
+        embedded = [name for name in image_features if self.features[name]["dtype"] == "image"]
+        numbers = (ACTION, STATE, ENVIRONMENT, INTERVENTION_COLUMN, SAFE_COLUMN)
+        wanted = [name for name in numbers if name in self.features] + embedded
+        if self.traced:
+            wanted += [CHUNK, ROWS, "request", "captured_at"]
+        columns = self._columns(episode, wanted)
+
+        actions = np.array(columns[ACTION], np.float32).reshape(episode.length, -1)
+        cameras = self._cameras(image_features, names)
+        state_features = self._state_features(names, policy)
+        videos = {name: self._video(episode, name) for name in cameras if name not in embedded}
+        for i in range(episode.length):
+            images = {}
+            for feature, camera in cameras.items():
+                image = next(videos[feature]) if feature in videos else _embedded_image(columns[feature][i])
+                images[camera] = self._original_size(image, camera)
+            values = {name: np.atleast_1d(np.array(columns[name][i], np.float32)) for name in state_features}
+            state, gripper = divided_state(values, state_features)
+
+            info: dict[str, Any] = {}
+            expected = actions[i:]
+            if self.traced:
+                info = {CAPTURED: columns["captured_at"][i], **_read_values(columns["request"][i])}
+                chunk = np.array(columns[CHUNK][i], np.float32).reshape(-1, actions.shape[1])
+                expected = chunk[: columns[ROWS][i]]
+            intervention = INTERVENTION_COLUMN in columns and bool(columns[INTERVENTION_COLUMN][i])
+            # Datasets of earlier releases also mark an operator's action that the guard refused.
+            refused = SAFE_COLUMN in columns and bool(columns[SAFE_COLUMN][i])
+            yield RecordedStep(i, Obs(images, gripper, state, info), expected, intervention and not refused)
+
+    def _episodes(self) -> list[RecordedEpisode]:
+        """Read the episodes from the metadata, in the order of their indices."""
+        rows: list[dict[str, Any]] = []
+        if self.version.startswith("v2."):
+            lines = (self.root / "meta/episodes.jsonl").read_text().splitlines()
+            rows += [json.loads(line) for line in lines if line.strip()]
+        else:
+            for path in sorted(self.root.glob("meta/episodes/*/*.parquet")):
+                with self._pq.ParquetFile(path) as file:
+                    names = [name for name in file.schema_arrow.names if not name.startswith("stats/")]
+                    rows += file.read(names).to_pylist()
+        rows.sort(key=lambda row: row["episode_index"])
+        episodes = []
+        for row in rows:
+            instruction = str(next(iter(row.get("tasks") or ()), ""))
+            episodes.append(RecordedEpisode(self, row["episode_index"], row["length"], instruction, row))
+        return episodes
+
+    def _columns(self, episode: RecordedEpisode, names: Sequence[str]) -> dict[str, list[Any]]:
+        """Read columns of the rows of an episode."""
+        file = self.root / self.info["data_path"].format(**self._file_indices(episode, "data"))
+        filters = [("episode_index", "=", episode.index)]
+        table = self._pq.read_table(file, columns=list(names), filters=filters)
+        columns: dict[str, list[Any]] = table.to_pydict()
+        if any(len(values) != episode.length for values in columns.values()):
+            raise ConfigError(
+                f"{file}: expected {episode.length} frames of episode {episode.index}, got another number; "
+                f"is the file complete?"
+            )
+        return columns
+
+    def _file_indices(self, episode: RecordedEpisode, kind: str) -> dict[str, int]:
+        """Return the numbers in the path of the file with an episode's rows, or with its video."""
+        if self.version.startswith("v2."):
+            chunk = episode.index // int(self.info["chunks_size"])
+            return {"episode_index": episode.index, "episode_chunk": chunk}
+        return {name: episode.metadata[f"{kind}/{name}"] for name in ("chunk_index", "file_index")}
+
+    def _video(self, episode: RecordedEpisode, feature: str) -> Iterator[np.ndarray]:
+        """Yield the images of an episode, (H, W, 3) uint8 RGB."""
+        indices = self._file_indices(episode, f"videos/{feature}")
+        file = self.root / self.info["video_path"].format(video_key=feature, **indices)
+        start_s = float(episode.metadata.get(f"videos/{feature}/from_timestamp") or 0)
+        convert = rgb_converter()
+        with self._av.open(str(file)) as container:
+            [stream, *_] = container.streams.video
+            if start_s:
+                container.seek(int(start_s / stream.time_base), stream=stream)
+            for frame in container.decode(stream):
+                if frame.time >= start_s - 0.5 / self.info["fps"]:
+                    yield convert(frame)
+        raise ConfigError(f"{file}: has fewer than the {episode.length} frames of episode {episode.index}")
+
+    def _original_size(self, image: np.ndarray, camera: str) -> np.ndarray:
+        """Return an image without the row and the column that were added to make the size of its video even."""
+        cameras = {} if self.contract is None else self.contract.contract.cameras or {}
+        spec = cameras.get(camera)
+        if spec is None or spec.height is None or spec.width is None:
+            return image
+        return np.ascontiguousarray(image[: spec.height, : spec.width])
+
+    def _cameras(self, image_features: Sequence[str], names: Names) -> dict[str, str]:
+        """Return the policy's name of each feature that contains images."""
+        known = {} if self.contract is None else self.contract.cameras
+        by_feature = {feature: known.get(feature, feature.removeprefix(IMAGES)) for feature in image_features}
+        if not names.cameras:
+            return by_feature
+        features = {camera: feature for feature, camera in by_feature.items()}
+        features |= {feature: feature for feature in image_features}
+        unknown = [name for name in names.cameras.values() if name not in features]
+        if unknown:
+            raise ConfigError(
+                f"--camera-map: expected some of {sorted(by_feature.values())} of {self.root}, got {unknown[0]!r}"
+                f"{did_you_mean(unknown[0], features)}"
+            )
+        return {features[name]: camera for camera, name in names.cameras.items()}
+
+    def _state_features(self, names: Names, policy: Contract | None) -> dict[str, list[tuple[str, int]]]:
+        """Return the parts, and their widths, of each state feature."""
+        widths = {name: int(self.features[name]["shape"][0]) for name in (STATE, ENVIRONMENT) if name in self.features}
+        if self.contract is not None and names.state is None:
+            specs = self.contract.contract.state or {}
+            order = {STATE: self.contract.state, ENVIRONMENT: self.contract.environment}
+            return {
+                name: [(part, int(specs[part].dim or 0) if part in specs else 1) for part in order[name]]
+                for name in widths
+            }
+        features: dict[str, list[tuple[str, int]]] = {}
+        if ENVIRONMENT in widths:
+            features[ENVIRONMENT] = [(ENVIRONMENT.rpartition(".")[2], widths[ENVIRONMENT])]
+        if STATE in widths:
+            features[STATE] = state_parts(widths[STATE], policy, names.state, option="--state joints,gripper")
+        return features
+
+
+def _embedded_image(value: Mapping[str, Any]) -> np.ndarray:
+    """Decode an image of the table, (H, W, 3) uint8 RGB."""
+    data = value.get("bytes")
+    if not data:
+        raise ConfigError(
+            f"expected the bytes of an image in the table, got a path, {value.get('path')!r}; LeRobot embeds images"
+        )
+    return jpeg_png.decode(data, DEFAULT_LIMITS.pixels)
+
+
+def _read_values(text: str) -> dict[str, Any]:
+    """Read a column of values by name, which is empty if there are none."""
+    return dict(from_text(text, Budget(DEFAULT_LIMITS))) if text else {}
