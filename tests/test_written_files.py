@@ -23,6 +23,15 @@ def test_the_names_of_all_plugins_are_published() -> None:
     assert tables.PUBLISHED.read_text() == tables.published(), "run `python tests/support/tables.py`"
 
 
+def test_the_example_of_a_plugin_is_what_the_skeleton_writes() -> None:
+    expected = tables.example_plugin()
+    for path, text in expected.items():
+        assert path.read_text() == text, "run `python tests/support/tables.py`"
+    written = {path for path in tables.PLUGIN.rglob("*") if path.is_file()}
+    ignored = {path for path in written if not {"__pycache__", "homing.egg-info", "runs"}.isdisjoint(path.parts)}
+    assert written - ignored == set(expected)
+
+
 def test_each_adapter_has_a_page_and_each_page_an_adapter() -> None:
     for folder, adapters in (("policies", entries("policies")), ("benchmarks", entries("envs"))):
         named = {tables.page_of(name, one) for name, one in adapters.items() if one.about}

@@ -1,5 +1,7 @@
 """The tables of README and docs/ about policies and environments: `python tests/support/tables.py` writes them.
 
+It also writes examples/plugin, by the skeleton of `vlagents-ray new plugin`, and published.json.
+
 They are made from the registry and from what tests have verified, and lie between `<!-- table: NAME -->` and
 `<!-- /table -->`. So are the pages in the navigation of mkdocs.yml.
 """
@@ -15,11 +17,13 @@ import tomllib
 from programs import others, ran, settings
 from verified import RUN_WITH, marked, notes
 
+from vlagents_ray.cli.new import render
 from vlagents_ray.evaluate.results.statistics import wilson
 from vlagents_ray.registry import CORE, RegistryEntry, entries
 
 ROOT = Path(__file__).parents[2]
 PUBLISHED = ROOT / "vlagents_ray" / "published.json"
+PLUGIN, PLUGIN_NAME = ROOT / "examples" / "plugin", "homing"
 RATES = json.loads((ROOT / "tests/rates.json").read_text())  # which the tests that it names find again
 LEARNT = json.loads((ROOT / "reference/checkpoint/rates.json").read_text())  # of the reference policy, by simulator
 WAYS = json.loads((ROOT / "reference/success.json").read_text())["ways"]  # of serving it, by `benchmarks.success`
@@ -53,6 +57,11 @@ def published() -> str:
             kind = kinds.setdefault(group.removeprefix("vlagents_ray."), {})
             kind.update(dict.fromkeys(points, project["name"]))
     return json.dumps(kinds, indent=2, sort_keys=True) + "\n"
+
+
+def example_plugin() -> dict[Path, str]:
+    """Return the text of each file of examples/plugin, which is what `vlagents-ray new plugin homing` writes."""
+    return {PLUGIN / path.relative_to(PLUGIN_NAME): text for path, text in render(PLUGIN_NAME, "plugin").items()}
 
 
 def page_of(name: str, one: RegistryEntry) -> str:
@@ -183,6 +192,9 @@ def main() -> None:
         path = ROOT / file
         path.write_text(with_tables(file, path.read_text()))
     PUBLISHED.write_text(published())
+    for path, text in example_plugin().items():
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text(text)
 
 
 if __name__ == "__main__":

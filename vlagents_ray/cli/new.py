@@ -40,6 +40,7 @@ _FILES = {
         "$name/$name/command.py": "command",
     },
 }
+Kind = Literal["policy", "env", "dialect", "plugin"]
 Name = Annotated[str, typer.Argument(metavar="NAME", help="Name of the module: lower case, such as my_policy.")]
 
 
@@ -91,16 +92,22 @@ def plugin(name: Name) -> None:
         )
 
 
-def _write(name: str, kind: Literal["policy", "env", "dialect", "plugin"]) -> None:
-    """Write the files into the current folder, or none of them. Raises `ConfigError` for an invalid name."""
-    if not re.fullmatch(r"[a-z][a-z0-9_]*", name) or keyword.iskeyword(name):
-        raise ConfigError(f"NAME: got {name!r}, want the name of a Python module in lower case, such as my_policy")
+def render(name: str, kind: Kind) -> dict[Path, str]:
+    """Return the text of each file of a skeleton; the paths are relative to the folder of the user."""
     names = {"name": name, "title": "".join(word.title() for word in name.split("_"))}
     templates = files(__package__ or "") / "skeletons" / kind
     texts = {}
     for file, source in _FILES[kind].items():
         template = (templates / f"{source}.template").read_text("utf-8")
         texts[Path(Template(file).substitute(names))] = Template(template).substitute(names)
+    return texts
+
+
+def _write(name: str, kind: Kind) -> None:
+    """Write the files into the current folder, or none of them. Raises `ConfigError` for an invalid name."""
+    if not re.fullmatch(r"[a-z][a-z0-9_]*", name) or keyword.iskeyword(name):
+        raise ConfigError(f"NAME: got {name!r}, want the name of a Python module in lower case, such as my_policy")
+    texts = render(name, kind)
     if there := [str(path) for path in texts if path.exists()]:
         raise ConfigError(f"{', '.join(there)}: there already, and nothing was written; choose another NAME")
     if importlib.util.find_spec(name) is not None:

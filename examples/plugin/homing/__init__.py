@@ -1,0 +1,1 @@
+"""A policy for vlagents-ray, a part of its server, and a command."""

@@ -1,0 +1,32 @@
+"""`pip install -e .`, then `pytest` or `python test_homing.py`."""
+
+import json
+import urllib.request
+
+import numpy as np
+from homing.policy import Homing
+
+from vlagents_ray import Obs, RemoteAgent
+from vlagents_ray.registry import policy_class
+from vlagents_ray.serve.launch.deployment_file import read_deployment
+from vlagents_ray.serve.launch.server import running_server
+from vlagents_ray.testing import check_agent
+
+
+def test_the_policy_is_registered_and_keeps_its_contract():
+    assert policy_class("homing") is Homing
+    check_agent(Homing())
+
+
+def test_its_calls_are_counted_where_it_is_served():
+    obs = Obs(state={"joints": np.ones(3, np.float32)})
+    with running_server(read_deployment("homing.yaml")) as server, RemoteAgent(server.url) as agent:
+        agent.reset(obs, "go home")
+        np.testing.assert_allclose(agent.act(obs).action, -0.1 * np.ones(3), rtol=1e-6)
+        with urllib.request.urlopen(f"{server.url}/homing/latency", timeout=10) as answer:
+            assert json.load(answer)["calls"] == 1
+
+
+if __name__ == "__main__":
+    test_the_policy_is_registered_and_keeps_its_contract()
+    test_its_calls_are_counted_where_it_is_served()
