@@ -15,13 +15,13 @@ from typing import Annotated
 import numpy as np
 import typer
 
+from vlagents_ray.datasets.writer import Dataset
 from vlagents_ray.envs import EvalEnv, make_env
 from vlagents_ray.errors import InvalidObservation
 from vlagents_ray.evaluate import Results, compare
 from vlagents_ray.interface import Act
 from vlagents_ray.policies.experts.tabletop import TabletopExpert
 from vlagents_ray.policies.reference import Reference
-from vlagents_ray.robot.dataset import Dataset
 
 TAKE_OVER = 20  # ticks within which the expert may; an episode of a success has 31
 OPEN = 0.9  # opening of a gripper that holds nothing

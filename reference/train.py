@@ -23,6 +23,7 @@ import torch
 import typer
 from torch.nn.functional import smooth_l1_loss
 
+from vlagents_ray.datasets.episode import INTERVENTION_COLUMN
 from vlagents_ray.policies.base.model_inputs import resize_with_pad, state_vector
 from vlagents_ray.policies.reference.checkpoint import (
     CAMERAS,
@@ -38,7 +39,6 @@ from vlagents_ray.policies.reference.checkpoint import (
 )
 from vlagents_ray.policies.reference.network import ReferenceNetwork, read_network
 from vlagents_ray.ray_tools.git_state import code_in
-from vlagents_ray.robot.episode import INTERVENTION_COLUMN
 from vlagents_ray.weights.safetensors import write_values
 from vlagents_ray_learn.open_loop.recorded_dataset import Names, RecordedDataset
 

@@ -25,7 +25,7 @@ FILES = (
     ),
     *("ray_tools/session", "ray_tools/private", "ray_tools/reaper"),
 )
-FOLDERS = ("chunking", "client", "images", "protocol", "robot", "weights")
+FOLDERS = ("chunking", "client", "datasets", "images", "protocol", "robot", "weights")
 LIGHT = [*(f"{name}.py" for name in FILES), *(f"{name}/**/*.py" for name in FOLDERS)]
 HEAVY = {
     *("ray", "torch", "pydantic", "jinja2", "starlette", "fastapi", "gymnasium", "PIL", "yaml", "typer", "rich", "av"),

@@ -11,10 +11,10 @@ import numpy as np
 import pytest
 
 from vlagents_ray import Act, ActionSpec, Agent, ChunkPlayer, ConfigError, Contract, Obs, PlayerSettings
+from vlagents_ray.datasets.writer import Dataset
 from vlagents_ray.errors import InvalidAction
 from vlagents_ray.interface import SAFE
 from vlagents_ray.robot import Guard, Limits
-from vlagents_ray.robot.dataset import Dataset
 
 HZ = 50.0
 SPEED, ACCELERATION, JERK = 1.0, 20.0, 800.0

@@ -21,8 +21,8 @@ from eval_fakes import wait_for
 from vlagents_ray import ConfigError, Obs
 from vlagents_ray.contract import ActionSpec, CameraSpec, Contract, StateSpec
 from vlagents_ray.dataset_contract import BYTES, INFO, STATISTICS, DatasetContract
+from vlagents_ray.datasets.writer import Dataset
 from vlagents_ray.errors import InvalidObservation
-from vlagents_ray.robot.dataset import Dataset
 from vlagents_ray.robot.record import Recorder
 
 FPS = 25

@@ -14,10 +14,10 @@ from typing import get_args
 
 import numpy as np
 
+from vlagents_ray.datasets.episode import Label, RunningEpisode
+from vlagents_ray.datasets.writer import Dataset
 from vlagents_ray.errors import ConfigError
 from vlagents_ray.interface import CAPTURED, Obs, copied
-from vlagents_ray.robot.dataset import Dataset
-from vlagents_ray.robot.episode import Label, RobotEpisode
 
 _NICE = 5  # the writing thread runs after the control loop's
 
@@ -60,7 +60,7 @@ class Recorder:
         self._label: Label | None = None
         self._frames = frames
         # What the thread does next, given the running episode; each returns the one that runs then. None ends it.
-        self._queue: queue.SimpleQueue[Callable[[RobotEpisode | None], RobotEpisode | None] | None]
+        self._queue: queue.SimpleQueue[Callable[[RunningEpisode | None], RunningEpisode | None] | None]
         self._queue = queue.SimpleQueue()
         self._put = 0  # frames added, counted by the loop's thread
         self._got = 0  # frames taken from the queue, counted by the writing thread
@@ -133,7 +133,7 @@ class Recorder:
             obs = Obs(obs.cameras, obs.gripper, obs.state, {CAPTURED: time.time()})
         seen, applied = copied(obs), np.array(action)
 
-        def write(episode: RobotEpisode | None) -> RobotEpisode | None:
+        def write(episode: RunningEpisode | None) -> RunningEpisode | None:
             self._got += 1
             if episode is not None:  # else it was abandoned after an error
                 episode.add(seen, applied, float(seen.info[CAPTURED]), tick, safe, intervention, wanted)
@@ -161,7 +161,7 @@ class Recorder:
     def _run(self) -> None:
         with contextlib.suppress(OSError):
             os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), _NICE)
-        episode: RobotEpisode | None = None
+        episode: RunningEpisode | None = None
         while (step := self._queue.get()) is not None:
             try:
                 episode = step(episode)
@@ -173,7 +173,7 @@ class Recorder:
         if episode is not None:
             episode.abandon()
 
-    def _end(self, label: Label | None, episode: RobotEpisode | None) -> None:
+    def _end(self, label: Label | None, episode: RunningEpisode | None) -> None:
         if episode is not None and episode.rows and label != "discard":
             self._dataset.save(episode.finish(label))
         elif episode is not None:

@@ -34,9 +34,9 @@ from lerobot.transport.utils import (
 from lerobot.utils.constants import OBS_STATE
 
 from vlagents_ray import Obs
+from vlagents_ray.datasets.episode import Label, camera_keys, state_vector
 from vlagents_ray.errors import ConfigError, Overloaded, PolicyUnavailable
 from vlagents_ray.interface import copied
-from vlagents_ray.robot.episode import Label, camera_keys, state_vector
 
 _PARTS = {"policy": "actor", "discrete_critic": "discrete_critic"}  # the learner's names -> the policy's modules
 _SEND_S = 60.0  # time limit for the transitions of an episode

@@ -21,13 +21,13 @@ from wrist_roll_env import ROLLER, TILTED_ROLLER, Roller, Turner
 
 from vlagents_ray.contract import ActionSpec, CameraSpec, Contract, StateSpec
 from vlagents_ray.dataset_contract import BYTES, INFO, STATISTICS, DatasetContract
+from vlagents_ray.datasets.episode import FinishedEpisode
+from vlagents_ray.datasets.writer import Dataset
 from vlagents_ray.errors import ConfigError
 from vlagents_ray.evaluate import EvalConfig, Results
 from vlagents_ray.evaluate.artifacts.recorder import Trajectory
 from vlagents_ray.evaluate.exports import to_lerobot
 from vlagents_ray.interface import Act, Obs
-from vlagents_ray.robot.dataset import Dataset
-from vlagents_ray.robot.episode import Finished
 
 Config = Callable[..., EvalConfig]
 CAMERA = {"camera": [32, 48]}
@@ -93,7 +93,7 @@ def test_after_an_export_that_failed_the_same_command_works(
     results = play(config(episodes=2, record="all"))
     save, saved = Dataset.save, []
 
-    def disk_full_at_the_second(dataset: Dataset, episode: Finished) -> None:
+    def disk_full_at_the_second(dataset: Dataset, episode: FinishedEpisode) -> None:
         if saved:
             raise OSError(errno.ENOSPC, "No space left on device")
         saved.append(episode)

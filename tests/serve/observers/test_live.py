@@ -17,12 +17,12 @@ import numpy as np
 import pytest
 from eval_fakes import Clock
 
+from vlagents_ray.datasets.writer import Dataset
 from vlagents_ray.errors import InvalidInput, MessageTooLarge, Overloaded, StorageFailed
 from vlagents_ray.images import jpeg_png
 from vlagents_ray.interface import Act, Obs
 from vlagents_ray.policies.noop import Noop
 from vlagents_ray.protocol.messages import DecodedFiles, Reply, Request
-from vlagents_ray.robot.dataset import Dataset
 from vlagents_ray.serve.config.deployment import LiveArgs
 from vlagents_ray.serve.engine.engine import Engine
 from vlagents_ray.serve.engine.observer import Observer, Observers

@@ -19,11 +19,11 @@ import pytest
 from eval_fakes import wait_for
 from recorded_sessions import Brightness, recorded, reply_of, seen
 
+from vlagents_ray.datasets.writer import Dataset
 from vlagents_ray.errors import ConfigError
 from vlagents_ray.interface import Obs
 from vlagents_ray.protocol.messages import DEFAULT_LIMITS, Budget, Request
 from vlagents_ray.protocol.values import from_text
-from vlagents_ray.robot.dataset import Dataset
 from vlagents_ray.serve.observers import episodes, recording
 from vlagents_ray.serve.observers.recording import SessionRecorder, Worker
 

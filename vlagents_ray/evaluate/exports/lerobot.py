@@ -21,21 +21,13 @@ from vlagents_ray.dataset_contract import (
     rotation_centre_of,
     rotation_vector_in,
 )
-from vlagents_ray.errors import ConfigError
-from vlagents_ray.evaluate.artifacts.recorder import DEFAULT_FPS, Trajectory, videos_of
-from vlagents_ray.evaluate.artifacts.storage import link_or_copy, require_there, whole_folder
-from vlagents_ray.evaluate.results.reader import CellResults, Episode, Results
-from vlagents_ray.images.mp4 import rgb_converter
-from vlagents_ray.naming import did_you_mean, distinct
-from vlagents_ray.registry import require
-from vlagents_ray.robot.dataset import UNFINISHED, Dataset
-from vlagents_ray.robot.episode import (
+from vlagents_ray.datasets.episode import (
     ACTION,
     ENVIRONMENT,
     INDEX,
     OUTCOMES,
     STATE,
-    Finished,
+    FinishedEpisode,
     ImageStatistics,
     Stats,
     camera_keys,
@@ -47,6 +39,14 @@ from vlagents_ray.robot.episode import (
     video_feature,
     without_slash,
 )
+from vlagents_ray.datasets.writer import UNFINISHED, Dataset
+from vlagents_ray.errors import ConfigError
+from vlagents_ray.evaluate.artifacts.recorder import DEFAULT_FPS, Trajectory, videos_of
+from vlagents_ray.evaluate.artifacts.storage import link_or_copy, require_there, whole_folder
+from vlagents_ray.evaluate.results.reader import CellResults, Episode, Results
+from vlagents_ray.images.mp4 import rgb_converter
+from vlagents_ray.naming import did_you_mean, distinct
+from vlagents_ray.registry import require
 
 GRIPPER_FEATURE = "observation.gripper"
 VERSION = "policy_version"
@@ -229,7 +229,7 @@ def _angles(demonstrations: Iterable[_Demonstration]) -> dict[int, Centre]:
     return {place: centre for place, centre in centres.items() if centre is not None}
 
 
-def _finished(one: _Demonstration, angles: Mapping[int, Centre], folder: Path) -> Finished:
+def _finished(one: _Demonstration, angles: Mapping[int, Centre], folder: Path) -> FinishedEpisode:
     """Return the episode in the dataset's form, after putting its videos into `folder`."""
     keys = camera_keys(one.videos)
     names = {key: camera for camera, key in keys.items()}
@@ -254,7 +254,7 @@ def _finished(one: _Demonstration, angles: Mapping[int, Centre], folder: Path) -
             images[key], features[key] = seen.result(), video_feature(stream.height, stream.width, _fps(one.cell))
         videos[key] = folder / f"{key}.mp4"
         link_or_copy(video, videos[key])
-    return Finished(one.episode.result.instruction, features, rows, images, videos, about)
+    return FinishedEpisode(one.episode.result.instruction, features, rows, images, videos, about)
 
 
 def _numbers(one: _Demonstration, about: DatasetContract) -> tuple[dict[str, np.ndarray], dict[str, Any]]:

@@ -16,10 +16,10 @@ import numpy as np
 
 from vlagents_ray.contract import ActionSpec, Contract
 from vlagents_ray.dataset_contract import CHUNK, ROWS, SESSION, TRACE
+from vlagents_ray.datasets.episode import RunningEpisode
+from vlagents_ray.datasets.writer import Dataset
 from vlagents_ray.errors import VLAgentsError
 from vlagents_ray.interface import Obs
-from vlagents_ray.robot.dataset import Dataset
-from vlagents_ray.robot.episode import RobotEpisode
 
 logger = logging.getLogger(__name__)
 
@@ -43,7 +43,7 @@ class RecordedAct:
     chunk: np.ndarray  # (H, D) float32
     captured_at: float  # s since 1970
     tick: int  # number of acts of the session since its reset
-    columns: Mapping[str, Any]  # see `RobotEpisode.add`
+    columns: Mapping[str, Any]  # see `RunningEpisode.add`
 
     @property
     def shapes(self) -> tuple[Any, ...]:
@@ -74,7 +74,7 @@ class _Running:
     reset: str  # options of the reset, as `to_text` writes them; empty once they are recorded
     weights: str  # the loaded weights in the reset's info, as text; empty once recorded
     shelf: _Shelf | None = None  # dataset of `episode`
-    episode: RobotEpisode | None = None  # None before the first frame
+    episode: RunningEpisode | None = None  # None before the first frame
     frames: int = 0  # number of frames of `episode`
     size: int = 0  # size of its numbers, bytes
 

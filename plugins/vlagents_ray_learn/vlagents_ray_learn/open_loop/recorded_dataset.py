@@ -21,6 +21,7 @@ from vlagents_ray.dataset_contract import (
     divided_state,
     state_parts,
 )
+from vlagents_ray.datasets.episode import ACTION, ENVIRONMENT, IMAGES, INTERVENTION_COLUMN, SAFE_COLUMN, STATE
 from vlagents_ray.errors import ConfigError
 from vlagents_ray.images import jpeg_png
 from vlagents_ray.images.mp4 import rgb_converter
@@ -29,7 +30,6 @@ from vlagents_ray.naming import did_you_mean
 from vlagents_ray.protocol.messages import DEFAULT_LIMITS, Budget
 from vlagents_ray.protocol.values import from_text
 from vlagents_ray.registry import require
-from vlagents_ray.robot.episode import ACTION, ENVIRONMENT, IMAGES, INTERVENTION_COLUMN, SAFE_COLUMN, STATE
 
 _IMAGE_DTYPES = ("video", "image")
 

@@ -1,4 +1,4 @@
-"""The running episode of a recording, with its videos on disk and its numbers in memory, and its statistics."""
+"""A running episode, with its videos on disk and its numbers in memory, and the statistics of a complete one."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ _KEY_FRAMES = 2  # frames between key frames, as LeRobot has for quick access to
 
 
 @dataclass(frozen=True, slots=True)
-class Finished:
+class FinishedEpisode:
     """A complete episode of N frames, whose files are moved into the dataset."""
 
     instruction: str
@@ -61,7 +61,7 @@ class Finished:
 
 
 @dataclass(slots=True, eq=False)
-class RobotEpisode:
+class RunningEpisode:
     """A running episode, to which frames are added."""
 
     folder: Path  # of its videos
@@ -123,7 +123,7 @@ class RobotEpisode:
         for key, value in frame.items():
             self.rows.setdefault(key, []).append(value)
 
-    def finish(self, label: Label | None = None) -> Finished:
+    def finish(self, label: Label | None = None) -> FinishedEpisode:
         """Complete the videos, and return the episode."""
         for _, video in self.videos.values():
             video.finish()
@@ -135,7 +135,7 @@ class RobotEpisode:
             success = np.zeros(len(rows[ACTION]), bool)
             success[-1] = label == "success"
             rows |= outcome_rows(success, success)
-        return Finished(
+        return FinishedEpisode(
             self.instruction,
             self.features,
             rows,

@@ -20,9 +20,17 @@ import numpy as np
 
 from vlagents_ray.contract import ActionSpec
 from vlagents_ray.dataset_contract import INFO, STATISTICS
+from vlagents_ray.datasets.episode import (
+    ACTION,
+    INTERVENTION_COLUMN,
+    FinishedEpisode,
+    RunningEpisode,
+    Stats,
+    joined,
+    of_values,
+)
 from vlagents_ray.errors import ConfigError
 from vlagents_ray.registry import require
-from vlagents_ray.robot.episode import ACTION, INTERVENTION_COLUMN, Finished, RobotEpisode, Stats, joined, of_values
 
 VERSION = "v3.0"
 FILE = "chunk-{chunk_index:03d}/file-{file_index:03d}"
@@ -85,7 +93,7 @@ class Dataset:
     def episodes(self) -> int:
         return int(self.info["total_episodes"])
 
-    def begin(self, instruction: str, meaning: ActionSpec | None = None) -> RobotEpisode:
+    def begin(self, instruction: str, meaning: ActionSpec | None = None) -> RunningEpisode:
         """Begin an episode, to which frames are added; it is then passed to `save`, or abandoned.
 
         Several may run at once. `meaning` describes the actions' numbers, if it is known.
@@ -94,11 +102,11 @@ class Dataset:
         unfinished.mkdir(parents=True, exist_ok=True)
         folder = Path(tempfile.mkdtemp(dir=unfinished))
         meaning = meaning or ActionSpec()
-        return RobotEpisode(
+        return RunningEpisode(
             folder, instruction, self.info["fps"], self.info["features"], self.interventions, self._lossless, meaning
         )
 
-    def save(self, episode: Finished) -> None:
+    def save(self, episode: FinishedEpisode) -> None:
         number, frames = self.episodes, len(episode.rows[ACTION])
         place = _place(number)
         first = int(self.info["total_frames"])
