@@ -11,7 +11,7 @@ for robot in tabletop metaworld; do
   "$bin/vlagents-ray" eval "reference/demonstrations/$robot.yaml" --out "$runs/$robot" --resume
   [ "$robot" = tabletop ] && objects=(--environment-state puck,target) || objects=()
   [ -d "$runs/data/$robot" ] ||
-    "$bin/vlagents-ray" export "$runs/$robot" "$runs/data/$robot" --to lerobot --successes "${objects[@]}"
+    "$bin/vlagents-ray" export "$runs/$robot" --out "$runs/data/$robot" --to lerobot --successes "${objects[@]}"
 done
 [ -d "$runs/checkpoint" ] ||
   "$bin/python" reference/train.py "$runs/data" "$runs/checkpoint" --work "$runs/train" --every 2 \

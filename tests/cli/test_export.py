@@ -48,14 +48,3 @@ def test_a_table_has_no_frames_to_choose(played: Path, tmp_path: Path) -> None:
     assert done.exit_code == 2
     assert "--state, --cut-idle: got --to csv, want --to lerobot" in " ".join(done.output.split())
     assert not (tmp_path / "t.csv").exists()
-
-
-def test_scores_have_settings_and_tables_have_none(played: Path, tmp_path: Path) -> None:
-    done = export(played, "--out", tmp_path / "t.csv", "--to", "csv", "--hub-set", "dataset=a/b")
-    assert done.exit_code == 2
-    assert "--hub-set: got --to csv, want --to hub" in " ".join(done.output.split())
-    done = export(
-        played, "--out", tmp_path / "card", "--to", "hub", "--hub-set", "dataset=a/b", "--hub-set", "task_id=roll"
-    )
-    assert done.exit_code == 0, done.output
-    assert "task_id: roll" in (tmp_path / "card/.eval_results/a_b.yaml").read_text()

@@ -77,12 +77,10 @@ def errors(*settings: type[BaseModel]) -> Iterator[None]:
             yield
     except ValidationError as error:
         from vlagents_ray.evaluate import EvalConfig
-        from vlagents_ray.evaluate.exports.scores import HubSettings
 
-        # The models that users write, and the options that set their fields.
-        models = {EvalConfig: None, HubSettings: "--hub-set"} | dict.fromkeys(settings)
-        known = next(((one, option) for one, option in models.items() if one.__name__ == error.title), (None, None))
-        fail(f"wrong settings: {wrong_settings(error, *known)}", 2)
+        models: tuple[type[BaseModel], ...] = (EvalConfig, *settings)
+        known = next((model for model in models if model.__name__ == error.title), None)
+        fail(f"wrong settings: {wrong_settings(error, known)}", 2)
     except ConfigError as error:
         fail(str(error), 2)
     except ClusterLost as error:

@@ -10,7 +10,7 @@ import typer
 
 from vlagents_ray.bounds import MOST_EPISODES
 from vlagents_ray.cli.console import errors, fresh, out, print_json, require_folder_of, table
-from vlagents_ray.cli.options import Address, AsJson, Live, LiveAt, finite, parse_list, parse_settings
+from vlagents_ray.cli.options import Address, AsJson, Live, LiveAt, finite, parse_list
 from vlagents_ray.errors import ConfigError
 
 _TABLES = ("json", "csv", "parquet")  # formats of one file
@@ -65,13 +65,10 @@ def report_command(
 
 def export_command(
     folder: Folder,
-    path: Annotated[Path, typer.Option("--out", help="File to write; of lerobot and hub, a new folder.")],
+    path: Annotated[Path, typer.Option("--out", help="File to write; of lerobot, a new folder.")],
     to: Annotated[
         str,
-        typer.Option(
-            help="json, csv, parquet: a row an episode; lerobot: a dataset of what was seen; hub: scores for a model's "
-            "repository."
-        ),
+        typer.Option(help="json, csv, parquet: a row an episode; lerobot: a dataset of what was seen."),
     ],
     policy: Annotated[str | None, typer.Option(help="Only this one: NAME, or NAME@STEP in a sweep.")] = None,
     env: Annotated[str | None, typer.Option(help="Only this one.")] = None,
@@ -84,12 +81,8 @@ def export_command(
     cut_idle: Annotated[
         bool, typer.Option("--cut-idle", help="lerobot: end each episode where nothing moves after it was solved.")
     ] = False,
-    settings: Annotated[
-        list[str],
-        typer.Option("--hub-set", metavar="KEY=VALUE", help="hub: dataset=OWNER/NAME, …"),
-    ] = [],  # noqa: B006 - typer reads it
 ) -> None:
-    """Write the episodes of an evaluation as JSON, CSV, Parquet or a LeRobotDataset v3.0; or its scores, to publish."""
+    """Write the episodes of an evaluation as JSON, CSV, Parquet or a LeRobotDataset v3.0."""
     from vlagents_ray.evaluate import Results
     from vlagents_ray.evaluate.artifacts.storage import storing
     from vlagents_ray.evaluate.exports import EXPORTS
@@ -103,9 +96,6 @@ def export_command(
         if chosen and to != "lerobot":
             given = ", ".join(f"--{name.replace('_', '-')}" for name in chosen)
             raise ConfigError(f"{given}: got --to {to}, want --to lerobot, whose frames they choose")
-        if settings and to != "hub":
-            raise ConfigError(f"--hub-set: got --to {to}, want --to hub, whose scores they describe")
-        chosen |= parse_settings(settings, "--hub-set")
         if to in _TABLES:
             require_folder_of(path)
         results = Results.load(folder).only(policy, env)

@@ -19,7 +19,6 @@ from rich.console import Console
 from vlagents_ray.errors import ConfigError
 from vlagents_ray.evaluate import Results, print_summary
 from vlagents_ray.evaluate.episode.records import EpisodeResult
-from vlagents_ray.evaluate.exports.scores import scores
 from vlagents_ray.evaluate.merge import merge
 from vlagents_ray.evaluate.plan.cases import EvalCase
 from vlagents_ray.evaluate.plan.jobs import EpisodeKey
@@ -148,14 +147,12 @@ def _outputs(results: Results) -> dict[str, list[float]]:
     print_summary(console, summary)
     page = write_report(results, results.out / "page.html").read_text()
     elements = page[page.index("<main") : page.index('id="configuration"')]
-    of_policies = [score.rate.to_json() for name in results.contenders for score in scores(results.only(name, None))]
     return {
         "summary.json": list(_numbers(summary.to_json())),
         "report --json": list(_numbers(families_json(summary))),
         "terminal": list(_numbers_of_text(console.file.getvalue())),  # type: ignore[attr-defined]
         "page": list(_numbers_of_text(elements)),
         "live page": list(_numbers(ResultsDocument(results.out).read())),
-        "hub": list(_numbers(of_policies)),
     }
 
 
