@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 
 from vlagents_ray.errors import MessageTooLarge, Overloaded
 from vlagents_ray.serve.engine.admission import Admission
-from vlagents_ray_dialects.client_reader import ClientReader
+from vlagents_ray_dialects.client_reader import ClientReader, share_of
 
 Pair = tuple[socket.socket, socket.socket]  # the client's end and the gateway's
 
@@ -89,3 +89,30 @@ def test_a_client_that_sends_nothing_or_too_slowly_ends(pair: Pair) -> None:
         read(reader, 2, silent_s=0.05)
     with pytest.raises(MessageTooLarge):
         reader.read(2, 10, time.monotonic() - 1)
+
+
+@pytest.mark.parametrize(
+    ("family", "address", "share"),
+    [
+        (socket.AF_INET, ("127.0.0.1", 0), "address 127.0.0.1"),
+        (socket.AF_INET6, ("::1", 0), "address ::1"),
+        (socket.AF_UNIX, "", "this machine"),
+    ],
+    ids=["IPv4", "IPv6", "Unix"],
+)
+def test_a_client_of_each_kind_of_socket_has_a_share(
+    family: socket.AddressFamily, address: tuple[str, int] | str, share: str
+) -> None:
+    """Also one that has left."""
+    with socket.socket(family) as listener, socket.socket(family) as client:
+        try:
+            listener.bind(address)
+        except OSError:
+            pytest.skip("this machine has no IPv6")
+        listener.listen()
+        client.connect(listener.getsockname())
+        connection, _ = listener.accept()
+        with connection:
+            assert share_of(connection) == share
+            ClientReader(connection, Admission(2**20), robot=True)
+        assert share_of(connection) == "address unknown"

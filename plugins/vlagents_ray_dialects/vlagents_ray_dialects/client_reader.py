@@ -21,9 +21,10 @@ _KEEP_ALIVE = (("TCP_KEEPIDLE", 20), ("TCP_KEEPINTVL", 5), ("TCP_KEEPCNT", 3), (
 def share_of(connection: socket.socket) -> str:
     """Return the name under which a client without a key has a share of the bytes in flight: that of its address."""
     try:
-        return f"address {connection.getpeername()[0]}"
+        peer = connection.getpeername()
     except OSError:  # the client is already gone
         return "address unknown"
+    return "this machine" if connection.family == socket.AF_UNIX else f"address {peer[0]}"
 
 
 def shut_down(connection: socket.socket, how: int = socket.SHUT_RDWR) -> None:
