@@ -26,7 +26,7 @@ from vlagents_ray.serve.access import api_keys
 from vlagents_ray.serve.dialects.base import GatewayContext
 from vlagents_ray.serve.engine.admission import Admission
 from vlagents_ray.serve.ports import LOOPBACK, reserve
-from vlagents_ray_dialects import gr00t
+from vlagents_ray_dialects import gateway_sessions, gr00t
 
 pytestmark = pytest.mark.own_process
 
@@ -209,7 +209,32 @@ def test_a_client_with_a_revoked_key_is_a_stranger_again(gateway: Gateway) -> No
     with gateway.connect(zmq.REQ) as robot:
         assert gateway.ping(robot, "vlr_robot")["status"] == "ok"
         gateway.keys.change("robot", revoked=True)
-        wait_for(lambda: gateway.clients == 0 and threads() == 0)
+        wait_for(lambda: gateway.clients == 0 and len(gateway.dialect._strangers) == 1)
         assert "revoked" in gateway.ping(robot, "vlr_robot")["error"]
         assert len(gateway.dialect._strangers) == 1
         assert gateway.clients == 0
+
+
+@pytest.mark.parametrize("cause", ["idle", "revoked key", "place given to another"])
+def test_a_client_that_loses_its_place_keeps_its_connection(
+    gateway: Gateway, monkeypatch: pytest.MonkeyPatch, cause: str
+) -> None:
+    """A request that crosses the end of a connection is lost, and ZeroMQ's clients wait for its answer for ever."""
+    with contextlib.ExitStack() as stack:
+        robot = stack.enter_context(gateway.connect(zmq.REQ))
+        monitor = stack.enter_context(robot.get_monitor_socket(zmq.EVENT_DISCONNECTED))
+        stack.callback(robot.disable_monitor)
+        assert gateway.ping(robot, "vlr_robot")["status"] == "ok"
+        [robots_place] = gateway.dialect._clients._clients
+        if cause == "idle":
+            monkeypatch.setattr(gateway_sessions, "_QUIET_S", 0.1)
+        elif cause == "revoked key":
+            gateway.keys.change("robot", revoked=True)
+        else:
+            others = [stack.enter_context(gateway.connect(zmq.REQ)) for _ in range(PLACES)]
+            for peer in others:
+                assert gateway.ping(peer, "vlr_robot")["status"] == "ok"
+        wait_for(lambda: gateway.dialect._clients.get(robots_place) is None)
+        answer = gateway.ping(robot, "vlr_robot")
+        assert "revoked" in answer["error"] if cause == "revoked key" else answer["status"] == "ok"
+        assert not monitor.poll(0)

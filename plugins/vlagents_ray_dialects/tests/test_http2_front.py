@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import contextlib
 import socket
-from collections.abc import Callable
+import threading
+import time
+from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 from pathlib import Path
@@ -153,3 +155,81 @@ def test_clients_of_one_server_are_told_apart_and_nothing_is_left() -> None:
     front.close()
     assert not accepting.alive()
     assert not Path(front.path).parent.exists()
+
+
+ANSWER = bytes(range(256)) * 32 * 1024  # more than the kernel's buffers hold
+
+
+class StoppedServer:
+    """A front whose server has written an answer of 8 MiB and ended, which the client has not read; and a stranger."""
+
+    def __init__(self, stack: contextlib.ExitStack) -> None:
+        self.client_peer = ""
+        front = Http2Front("test", self._is_client)
+        server = stack.enter_context(socket.socket(socket.AF_UNIX))
+        server.bind(front.path)
+        server.listen()
+        listener = stack.enter_context(socket.create_server(("127.0.0.1", 0)))
+        self.stranger, self.client = (self._connected(stack, front, listener) for _ in range(2))
+        self.stranger.sendall(PREFACE[:10])
+        self.client.sendall(PREFACE)
+        connection, peer = server.accept()
+        with connection:
+            self.client_peer = f"unix-abstract:{peer[1:].decode()}"
+            assert connection.recv(len(PREFACE), socket.MSG_WAITALL) == PREFACE
+            self._answering = threading.Thread(target=self._answer, args=(connection.dup(),))
+        self._answering.start()
+        wait_for(lambda: self.client.recv(1, socket.MSG_PEEK) == ANSWER[:1])
+        self._stopping = threading.Thread(target=front.close)
+        self._stopping.start()
+
+    def _is_client(self, peer: str) -> bool:
+        return peer == self.client_peer
+
+    @staticmethod
+    def _connected(stack: contextlib.ExitStack, front: Http2Front, listener: socket.socket) -> socket.socket:
+        connection = stack.enter_context(socket.create_connection(listener.getsockname(), timeout=10))
+        front.add(listener.accept()[0])
+        return connection
+
+    @staticmethod
+    def _answer(connection: socket.socket) -> None:
+        with connection, contextlib.suppress(OSError):  # the client does not read it
+            connection.sendall(ANSWER)
+
+    def join(self) -> None:
+        self._stopping.join()
+        self._answering.join()
+
+
+@pytest.fixture
+def stopped() -> Iterator[StoppedServer]:
+    with contextlib.ExitStack() as stack:
+        server = StoppedServer(stack)
+        yield server
+        server.join()
+
+
+@pytest.mark.parametrize("sends", [False, True], ids=["only reads", "sends more"])
+def test_the_last_answer_reaches_a_client_that_reads_it_after_the_front_closes(
+    stopped: StoppedServer, sends: bool
+) -> None:
+    """A client of HTTP/2 sends more, such as WINDOW_UPDATE, while it reads."""
+    read_to_the_end(stopped.stranger)  # which ends when the front begins to close
+    received = bytearray()
+    with contextlib.suppress(ConnectionError):
+        while data := stopped.client.recv(2**20):
+            received += data
+            if sends:
+                stopped.client.sendall(SETTINGS)
+    assert received == ANSWER
+
+
+def test_no_stranger_and_no_client_that_does_not_read_delays_a_stop(stopped: StoppedServer) -> None:
+    """The stranger's connection ends at once, that of the client after the time for its answers."""
+    begun = time.monotonic()
+    assert read_to_the_end(stopped.stranger) == b""
+    stranger_s = time.monotonic() - begun
+    stopped.join()
+    assert stranger_s < (time.monotonic() - begun) / 2
+    assert time.monotonic() - begun < http2_front._HANDSHAKE_S  # after which a stranger is disconnected anyway

@@ -228,9 +228,8 @@ class GatewayClients(Generic[K, C]):
 
     def forget_quiet(self) -> None:
         """End the sessions of idle clients and of clients whose key is no longer valid."""
-        now = time.monotonic()
         with self._lock:
-            removed = [key for key, client in self._clients.items() if self._is_gone(client, now)]
+            removed = [key for key, client in self._clients.items() if self.is_gone(client)]
             ended = [self._clients.pop(key) for key in removed]
         _end(ended)
 
@@ -240,7 +239,9 @@ class GatewayClients(Generic[K, C]):
             clients = list(self._clients.values())
         return _end(clients)
 
-    def _is_gone(self, client: C, now: float) -> bool:
+    def is_gone(self, client: C) -> bool:
+        """Return whether a client is idle, or its key is no longer valid."""
+        now = time.monotonic()
         patience_s = self._context.idle_s if client.sessions.begun else min(_QUIET_S, self._context.idle_s)
         return client.quiet_s(now) > patience_s or client.sessions.refusal() is not None
 

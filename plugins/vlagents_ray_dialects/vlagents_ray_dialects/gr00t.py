@@ -22,10 +22,11 @@ from vlagents_ray.registry import require
 from vlagents_ray.serve.access.api_keys import Caller, NoKey
 from vlagents_ray.serve.config.dialects import MappingSetting, PortConfig
 from vlagents_ray.serve.dialects.base import GatewayContext, PortDialect
+from vlagents_ray.serve.endpoints.connection import ANSWERS_S, wait_delivered
 from vlagents_ray.serve.engine.admission import Admission
 from vlagents_ray.serve.token_bucket import TokenBucket
 from vlagents_ray.wire.mapping import KeyMapping, matches
-from vlagents_ray_dialects.acceptor import Acceptor
+from vlagents_ray_dialects.acceptor import TICK_S, Acceptor
 from vlagents_ray_dialects.client_reader import ClientReader, set_keep_alive, share_of, shut_down
 from vlagents_ray_dialects.gateway_sessions import GatewayClient, GatewayClients, internal_error
 from vlagents_ray_dialects.messages import gr00t, zmtp
@@ -53,6 +54,8 @@ class GR00TConnection(GatewayClient):
     """One connection of a client, from its first byte to its last; a thread processes its requests in order.
 
     It is a stranger until one of its messages has a valid key, or needs none; then it is one of the dialect's clients.
+    An idle client is a stranger again and has no session, but its connection stays open: a client whose request crosses
+    the end of its connection would wait for an answer for ever.
     """
 
     def __init__(self, dialect: GR00TDialect, connection: socket.socket) -> None:
@@ -73,8 +76,13 @@ class GR00TConnection(GatewayClient):
         self.thread = threading.Thread(target=self._run, name="gr00t-client", daemon=True)
 
     def end(self) -> None:
-        """Process what has arrived, then end the sessions and the connection."""
+        """Give the client's place to another one; it is a stranger until its next message."""
         self.is_client = False
+        self._valid_until = float("inf")
+        self._dialect.add_stranger(self)
+
+    def stop_reading(self) -> None:
+        """Process what has arrived, then end the sessions and the connection."""
         shut_down(self._connection, socket.SHUT_RD)
 
     def cut_off(self, reason: str) -> None:
@@ -88,12 +96,12 @@ class GR00TConnection(GatewayClient):
             self._answered.wait_for(lambda: not self._unanswered, max(0.0, until - time.monotonic()))
 
     def refuse_waiting(self, error: VLAgentsError) -> None:
-        """Answer the request that is being processed with an error, and end the connection; on any thread.
+        """Answer a request that is still unanswered with an error, and end the connection; on any thread.
 
         The connection's thread waits for the policy and would not read the client's next request: after the end, ZeroMQ
         keeps that request for the server's successor.
         """
-        if self._send(_error(error)):
+        if self._unanswered and self._send(_error(error)):
             self.cut_off("the server is stopping")
 
     def _run(self) -> None:
@@ -109,6 +117,7 @@ class GR00TConnection(GatewayClient):
             logger.exception("gr00t: disconnected a client")
         finally:
             self._dialect.remove(self)
+            wait_delivered(self._connection, time.monotonic() + ANSWERS_S)
             shut_down(self._connection)
             self._connection.close()
             self.sessions.close()
@@ -152,8 +161,12 @@ class GR00TConnection(GatewayClient):
         envelope: list[bytes] = []
         deadline = float("inf")
         while True:
-            wait_s = self._context.idle_s if self.is_client else max(0.0, self._valid_until - time.monotonic())
-            first = self._reader.read(zmtp.HEAD_BYTES, wait_s, deadline)
+            try:
+                first = self._reader.read(zmtp.HEAD_BYTES, TICK_S, deadline)
+            except TimeoutError:
+                if not envelope:
+                    self._check_idle()
+                continue
             if first is None:
                 return None
             deadline = min(deadline, time.monotonic() + _MESSAGE_S)
@@ -175,6 +188,20 @@ class GR00TConnection(GatewayClient):
                     f"gr00t: expected an envelope of at most {_MOST_PARTS} parts and {_MOST_PART_BYTES} bytes"
                 )
             envelope.append(bytes(self._read(size, _MESSAGE_S, deadline)))
+
+    def _check_idle(self) -> None:
+        """End the sessions of an idle client or one whose key is no longer valid; raise if a stranger stays one."""
+        if not self.is_client:
+            self.sessions.close()
+            if time.monotonic() >= self._valid_until:
+                raise MessageTooLarge(f"gr00t: no message with a valid key within {_STRANGER_S:g} s")
+        elif self._dialect.is_gone(self):
+            has_valid_key = self.sessions.refusal() is None
+            self.sessions.close()
+            self._dialect.remove_client(self)
+            self.end()
+            if not has_valid_key:
+                self._valid_until = time.monotonic() + _STRANGER_S
 
     def _process_command(self, name: bytes, content: bytes) -> None:
         if self._commands.take(time.monotonic()) > 0:
@@ -265,7 +292,7 @@ class GR00TConnection(GatewayClient):
         """Count a message without a valid key; end the connection after too many."""
         self._refused += 1
         if self._refused >= _REFUSALS:
-            self.end()
+            self.stop_reading()
         else:
             time.sleep(_REFUSAL_S)
 
@@ -376,7 +403,7 @@ class GR00TDialect(PortDialect):
 
     def serve(self, listener: socket.socket) -> None:
         require("msgpack")
-        self._acceptor = Acceptor("gr00t", listener, self._add, self._clients.forget_quiet)
+        self._acceptor = Acceptor("gr00t", listener, self._add)
 
     def alive(self) -> bool:
         return self._acceptor is not None and self._acceptor.alive()
@@ -396,7 +423,7 @@ class GR00TDialect(PortDialect):
         with self._lock:
             connections = list(self._connections)
         for connection in connections:
-            connection.end()
+            connection.stop_reading()
         until = time.monotonic() + _LINGER_S
         for connection in connections:
             connection.thread.join(max(0.0, until - time.monotonic()))
@@ -419,21 +446,36 @@ class GR00TDialect(PortDialect):
         with self._lock:
             self._strangers.pop(connection, None)
 
+    def is_gone(self, client: GR00TConnection) -> bool:
+        """Return whether a client is idle, or its key is no longer valid."""
+        return self._clients.is_gone(client)
+
+    def remove_client(self, client: GR00TConnection) -> None:
+        """Give the place of a client to another one."""
+        self._clients.remove(id(client))
+
     def remove(self, connection: GR00TConnection) -> None:
         """Remove a connection that ends."""
-        self._clients.remove(id(connection))
+        self.remove_client(connection)
         with self._lock:
             self._strangers.pop(connection, None)
             self._connections.discard(connection)
 
-    def _add(self, connection: socket.socket) -> None:
-        client = GR00TConnection(self, connection)
+    def add_stranger(self, connection: GR00TConnection) -> None:
+        """Count an open connection among those without a valid key; if there are too many, end the oldest."""
         with self._lock:
+            if connection not in self._connections:
+                return
             oldest = next(iter(self._strangers)) if len(self._strangers) >= _STRANGERS else None
             if oldest is not None:
                 del self._strangers[oldest]
-            self._strangers[client] = None
-            self._connections.add(client)
+            self._strangers[connection] = None
         if oldest is not None:
             oldest.cut_off(f"{_STRANGERS} connections are without a valid key")
+
+    def _add(self, connection: socket.socket) -> None:
+        client = GR00TConnection(self, connection)
+        with self._lock:
+            self._connections.add(client)
+        self.add_stranger(client)
         client.thread.start()

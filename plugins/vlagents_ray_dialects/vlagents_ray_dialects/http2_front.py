@@ -7,6 +7,7 @@ preface, and reads no further from one that sends more small frames than a robot
 
 from __future__ import annotations
 
+import contextlib
 import logging
 import socket
 import struct
@@ -17,6 +18,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 from vlagents_ray.errors import MalformedMessage
+from vlagents_ray.serve.endpoints.connection import ANSWERS_S, wait_delivered
 from vlagents_ray.serve.token_bucket import TokenBucket
 from vlagents_ray_dialects.client_reader import set_keep_alive, share_of, shut_down
 from vlagents_ray_dialects.messages.http2 import PREFACE, FrameCounter
@@ -85,12 +87,20 @@ class Http2Front:
             self._shares.pop(connection.peer, None)
 
     def close(self) -> None:
-        """End all connections, and remove the socket."""
+        """Forward the last answers to clients, end all connections, and remove the socket.
+
+        gRPC's server must have been stopped.
+        """
         with self._lock:
             connections = list(self._connections)
-        for connection in connections:
-            connection.end()
         deadline = time.monotonic() + _END_S
+        clients = [connection for connection in connections if self._is_client(connection.peer)]
+        for connection in connections:
+            if connection not in clients:  # a stranger delays no stop
+                connection.end()
+        for connection in clients:
+            connection.wait_answered(deadline)
+            connection.end()
         for connection in connections:
             connection.thread.join(max(0.0, deadline - time.monotonic()))
         self._folder.cleanup()
@@ -108,6 +118,7 @@ class ForwardedConnection:
         self._allowed_frames = TokenBucket(_FRAMES_PER_S, time.monotonic(), _FRAMES_AT_ONCE)
         self._ended = threading.Event()
         self.thread = threading.Thread(target=self._run, name=f"{front.name}-requests", daemon=True)
+        self._answers = threading.Thread(target=self._forward_answers, name=f"{front.name}-answers", daemon=True)
 
     @property
     def is_open(self) -> bool:
@@ -120,21 +131,29 @@ class ForwardedConnection:
         shut_down(self._client)
         shut_down(self._server)
 
+    def wait_answered(self, deadline: float) -> None:
+        """Wait until the client has the answers of a gRPC server that has stopped.
+
+        Args:
+            deadline: Time until which to wait, s, of `time.monotonic()`.
+        """
+        if self._answers.is_alive():
+            self._answers.join(max(0.0, deadline - time.monotonic()))
+
     def _run(self) -> None:
-        answers = threading.Thread(target=self._forward_answers, name=f"{self._front.name}-answers", daemon=True)
         try:
             self._read_preface()
             self._front.set_share(self.peer, share_of(self._client))
             self._server.connect(self._front.path)
             self._server.sendall(PREFACE)
-            answers.start()
+            self._answers.start()
             self._forward_requests()
         except (MalformedMessage, OSError) as error:
             logger.info("%s: disconnected a client: %s", self._front.name, error)
         finally:
             self.end()
-            if answers.ident is not None:
-                answers.join()
+            if self._answers.ident is not None:
+                self._answers.join()
             self._front.remove(self)
             self._client.close()
             self._server.close()
@@ -161,12 +180,15 @@ class ForwardedConnection:
             while (wait_s := self._allowed_frames.take(time.monotonic(), frames)) > 0:
                 if self._ended.wait(wait_s):
                     return
-            self._server.sendall(data)
+            # After the end of gRPC's server, its last answers are still forwarded.
+            with contextlib.suppress(BrokenPipeError, ConnectionResetError):
+                self._server.sendall(data)
 
     def _forward_answers(self) -> None:
         try:
             while data := self._server.recv(_READ_BYTES):
                 self._client.sendall(data)
+            wait_delivered(self._client, time.monotonic() + ANSWERS_S)
         except OSError as error:
             logger.info("%s: disconnected a client: %s", self._front.name, error)
         finally:

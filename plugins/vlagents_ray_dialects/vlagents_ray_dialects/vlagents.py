@@ -29,6 +29,7 @@ from vlagents_ray.interface import Obs
 from vlagents_ray.serve.access.api_keys import NoKey
 from vlagents_ray.serve.config.dialects import DialectConfig, KeylessPortConfig
 from vlagents_ray.serve.dialects.base import GatewayContext, PortDialect
+from vlagents_ray.serve.endpoints.connection import ANSWERS_S, wait_delivered
 from vlagents_ray.serve.engine.admission import MessageAdmission
 from vlagents_ray.wire import json_numpy
 from vlagents_ray_dialects.acceptor import Acceptor
@@ -76,6 +77,7 @@ class VlagentsConnection:
         except Exception:
             logger.exception("vlagents: disconnected a client")
         finally:
+            wait_delivered(self._connection, time.monotonic() + ANSWERS_S)
             shut_down(self._connection)
             self._connection.close()
             self._segments.close()
@@ -110,11 +112,12 @@ class VlagentsConnection:
     def end(self) -> None:
         """Answer the current request with an error, and end the connection. From any thread."""
         error = PolicyUnavailable("the server is stopping; connect again")
-        with self._sending:
-            sequence, self._unanswered = self._unanswered, None
-            if sequence is not None:
-                with contextlib.suppress(OSError):  # the client is gone, or does not read
-                    self._send(rpyc.exception(sequence, "RuntimeError", f"{error.code}: {error}"))
+        if self._unanswered is not None:  # else the client may be reading an answer slowly, with the lock held
+            with self._sending:
+                sequence, self._unanswered = self._unanswered, None
+                if sequence is not None:
+                    with contextlib.suppress(OSError):  # the client is gone, or does not read
+                        self._send(rpyc.exception(sequence, "RuntimeError", f"{error.code}: {error}"))
         shut_down(self._connection)
 
     def _answer(self, call: RpycCall) -> bytes:

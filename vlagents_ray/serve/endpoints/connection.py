@@ -50,6 +50,8 @@ BACKLOGGED = "too much of it is unanswered"
 _TIMESTAMP = 35  # SO_TIMESTAMPNS of Linux, which Python's socket does not name
 _STAMP = struct.Struct("@qq")  # wall clock, s and ns
 STAMP_SPACE = socket.CMSG_SPACE(_STAMP.size)  # bytes of the time stamp in a message's control data
+ANSWERS_S = 1.0  # maximum time for clients to receive their last answers when a server ends
+_POLL_MS = 2
 LEAST_WAIT_S = 1e-3  # a shorter wait cannot be distinguished from the time to read a message
 
 Control = Sequence[tuple[int, int, bytes]]
@@ -214,6 +216,15 @@ class PolledConnection(ABC):
                 with contextlib.suppress(OSError):  # the client has already closed it
                     self._connection.shutdown(socket.SHUT_RDWR)
 
+    def announce_end(self, reason: str, code: int) -> None:
+        """Send the close code and its reason after the answers, and leave the connection open; on any thread."""
+        with self._sending:
+            if not self._ended:
+                self._send_close(code, reason)
+
+    def wait_answered(self, until: float) -> None:  # noqa: B027 - needed only where the kernel may discard answers
+        """Wait until the client has all answers, but at most until a time of `time.monotonic`, s."""
+
     def disconnect(self) -> None:
         """Stop polling the connection and close it; call this on the polling thread."""
         if not self._ended:
@@ -274,8 +285,14 @@ class PolledServer(ABC, Generic[C]):
         each_half_second.remove(self.close_overdue)
         self._listener.close()
         self._spare.close()
-        for client in list(self._clients):
-            client.end("the replica is stopping; connect again", _SERVICE_RESTART)
+        clients = list(self._clients)
+        reason = "the replica is stopping; connect again"
+        for client in clients:
+            client.announce_end(reason, _SERVICE_RESTART)
+        until = time.monotonic() + ANSWERS_S
+        for client in clients:
+            client.wait_answered(until)
+            client.end(reason, _SERVICE_RESTART)
             client.release()
 
     def accept(self) -> None:
@@ -350,6 +367,29 @@ def has_unread(connection: socket.socket) -> bool:
     """Return whether the socket has received data that are still unread."""
     waiting = array("i", [0])
     fcntl.ioctl(connection, termios.FIONREAD, waiting)
+    return waiting[0] > 0
+
+
+def wait_delivered(connection: socket.socket, until: float) -> None:
+    """Wait until the client's machine has received all that was sent over a TCP connection.
+
+    If bytes of the client are unread, or arrive later, the kernel resets a connection that is closed, and discards the
+    answers that it has not yet delivered.
+
+    Args:
+        until: Time of `time.monotonic` until which to wait, s. The wait also ends with the connection, which the client
+            or another thread may end.
+    """
+    ended = select.poll()
+    ended.register(connection, 0)  # reports errors and the end of both directions
+    while time.monotonic() < until and _has_undelivered(connection) and not ended.poll(_POLL_MS):
+        pass
+
+
+def _has_undelivered(connection: socket.socket) -> bool:
+    """Return whether the peer's machine has not acknowledged all bytes that were sent over a TCP connection."""
+    waiting = array("i", [0])
+    fcntl.ioctl(connection, termios.TIOCOUTQ, waiting)
     return waiting[0] > 0
 
 

@@ -64,6 +64,7 @@ from vlagents_ray.serve.endpoints.connection import (
     enable_timestamps,
     has_unread,
     time_in_socket_s,
+    wait_delivered,
 )
 from vlagents_ray.serve.engine.admission import ArrivingBytes, MessageAdmission, image_bytes
 from vlagents_ray.serve.engine.engine import Engine
@@ -382,6 +383,10 @@ class WebSocketConnection(PolledConnection):
             self._protocol.send_close(code, reason[:120])
             self._flush()
 
+    def wait_answered(self, until: float) -> None:
+        self._out.wait_sent(until)
+        wait_delivered(self._connection, until)
+
     def _handshake(self, head: bytes) -> bool:
         """Accept the handshake; return False if it is refused, before the refusal is sent."""
         with self._sending:
@@ -527,6 +532,7 @@ class SendBuffer:
         """Create an empty buffer; a client is cut off if more than `limit` bytes wait, or it reads none for 10 s."""
         self._connection, self._lock, self._limit = connection, lock, limit
         self._unsent = bytearray()
+        self._rest: threading.Thread | None = None  # sends the rest to a slow client
         self._slow = False  # whether a thread is sending the rest
         self._closed = self._last = False
 
@@ -543,9 +549,15 @@ class SendBuffer:
             self._send_now()
             if self._unsent:
                 self._slow = True
-                threading.Thread(target=self._send_rest, name="send-slowly", daemon=True).start()
+                self._rest = threading.Thread(target=self._send_rest, name="send-slowly", daemon=True)
+                self._rest.start()
         elif len(self._unsent) > self._limit:
             self._disconnect()
+
+    def wait_sent(self, until: float) -> None:
+        """Wait until the kernel has all bytes, but at most until a time of `time.monotonic`, s; without the lock."""
+        if self._rest is not None:
+            self._rest.join(max(0.0, until - time.monotonic()))
 
     def close(self) -> None:
         """Stop sending; call this before the connection is closed."""
