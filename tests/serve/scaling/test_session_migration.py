@@ -226,6 +226,14 @@ def test_a_replica_that_does_not_answer_delays_a_reset_only_a_little(replicas: C
     assert ask(served.engines[0], "reset", instruction="episode 1").error is None
 
 
+def test_a_reset_at_the_only_replica_does_not_wait_for_further_resets_to_announce(
+    replicas: Callable[[int], Replicas], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(session_migration, "_GATHER_S", 60.0)
+    answers = begin(replicas(1).engines[0], "reset", instruction="episode 1")
+    assert answers.get(timeout=20).error is None
+
+
 @pytest.mark.parametrize("gather_s", [0.0, 60.0])
 def test_a_reset_is_answered_if_its_replica_stops_meanwhile(
     replicas: Callable[[int], Replicas], gather_s: float, monkeypatch: pytest.MonkeyPatch

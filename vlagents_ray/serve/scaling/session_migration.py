@@ -513,9 +513,10 @@ class SessionMigrator:
     async def _announce_all(self) -> None:
         announced: list[Callable[[], None]] = []
         try:
-            await asyncio.sleep(_GATHER_S)
-            begun, announced = self._take_unannounced()
             peers = [] if self._closed else await self._peers()
+            if peers:
+                await asyncio.sleep(_GATHER_S)
+            begun, announced = self._take_unannounced()
             if peers:
                 answers = [self._spawn(self._answer(peer.ask(HeldSessions.drop_older, begun))) for peer in peers]
                 await asyncio.wait(answers, timeout=_OTHERS_S)
