@@ -8,7 +8,9 @@ from collections.abc import Iterator
 from functools import cache
 from pathlib import Path
 
+import pytest
 import tomllib
+from packaging.requirements import Requirement
 
 import vlagents_ray
 
@@ -69,18 +71,37 @@ def test_private_names_of_ray_are_in_one_module() -> None:
     assert users == {"vlagents_ray.ray_tools.private", by_value}
 
 
-def test_a_plugin_asks_for_the_package_of_its_own_version() -> None:
-    root = PACKAGE.parent
-    ours = tomllib.loads((root / "pyproject.toml").read_text())["project"]["version"]
-    found = [tomllib.loads(path.read_text())["project"] for path in sorted(root.glob("plugins/*/pyproject.toml"))]
-    assert [project["name"] for project in found] == [
-        "lerobot_policy_vlagents",
-        "vlagents_ray_arro",
-        "vlagents-ray-cluster",
-        "vlagents-ray-dialects",
-        "vlagents-ray-learn",
-        "vlagents-ray-sims",
-    ]
-    assert {project["version"] for project in found} == {ours}
-    asked = [{re.sub(r"\[.*\]", "", one) for one in project["dependencies"]} for project in found]
-    assert all(f"vlagents-ray>={ours}" in one for one in asked)
+ROOT = PACKAGE.parent
+PYPROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())
+PLUGINS = {
+    path.parent.name: tomllib.loads(path.read_text())["project"]
+    for path in sorted(ROOT.glob("plugins/*/pyproject.toml"))
+}
+OF_SERVER = {name: project for name, project in PLUGINS.items() if name.startswith("vlagents_ray_")}
+DISTRIBUTIONS = {project["name"] for project in OF_SERVER.values()}
+
+
+@pytest.mark.parametrize("name", PLUGINS)
+def test_a_plugin_asks_for_the_package_of_its_own_version(name: str) -> None:
+    version = PYPROJECT["project"]["version"]
+    assert PLUGINS[name]["version"] == version
+    without_extras = {re.sub(r"\[.*\]", "", text) for text in PLUGINS[name]["dependencies"]}
+    assert f"vlagents-ray>={version}" in without_extras
+
+
+def test_a_plugins_distribution_has_the_name_of_its_package() -> None:
+    assert {name.replace("_", "-") for name in OF_SERVER} == DISTRIBUTIONS
+
+
+def test_each_list_of_plugins_has_all_of_them() -> None:
+    """A plug-in that is missing in one is neither installed, checked nor kept out of the core."""
+    tools = PYPROJECT["tool"]
+    extra = PYPROJECT["project"]["optional-dependencies"]["all"]
+    assert {Requirement(text).name for text in extra} == {"vlagents-ray", *DISTRIBUTIONS}
+    assert tools["uv"]["sources"].keys() == {"vlagents-ray", *DISTRIBUTIONS}
+    assert tools["uv"]["workspace"]["members"] == ["plugins/vlagents_ray_*"]
+    assert {name for name in tools["mypy"]["packages"] if name.startswith("vlagents_ray_")} == OF_SERVER.keys()
+    contracts = {contract["name"]: contract for contract in tools["importlinter"]["contracts"]}
+    assert set(contracts["the core knows no plug-in"]["forbidden_modules"]) == OF_SERVER.keys()
+    [installed] = re.findall(r"^PLUGINS \?= (.*)$", (ROOT / "Makefile").read_text(), re.MULTILINE)
+    assert {f"vlagents_ray_{name}" for name in installed.split()} == OF_SERVER.keys()
