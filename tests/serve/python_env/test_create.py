@@ -54,6 +54,21 @@ def test_it_holds_this_package_with_the_same_ray_and_the_requirements(
         assert word in asked[-1]
 
 
+def test_a_plugin_on_the_path_of_modules_is_installed_from_its_checkout(
+    asked: list[str], requirements: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As in a PYTHONPATH: its metadata are those that setuptools wrote beside its sources."""
+    checkout = tmp_path / "checkout"
+    metadata = checkout / "some_plugin.egg-info" / "PKG-INFO"
+    metadata.parent.mkdir(parents=True)
+    metadata.write_text("Metadata-Version: 2.4\nName: some-plugin\nVersion: 0.1.0\n")
+    (checkout / "pyproject.toml").touch()
+    monkeypatch.syspath_prepend(checkout)
+    monkeypatch.setattr(making, "plugin_distributions", lambda: ["some-plugin"])
+    make_environment(requirements, tmp_path / "env")
+    assert f"--no-deps --editable {checkout}" in asked[-1]
+
+
 def test_one_that_cannot_be_filled_is_removed_unless_it_was_there(
     monkeypatch: pytest.MonkeyPatch, requirements: Path, tmp_path: Path
 ) -> None:

@@ -204,10 +204,13 @@ def _plugins(scratch: Path) -> list[str]:
 
 
 def _editable_source(installed: importlib.metadata.Distribution) -> Path | None:
-    """Return the folder of a distribution that is installed as editable; None for any other.
+    """Return the folder of a distribution that is installed as editable, or found in a checkout; None for any other.
 
     See https://packaging.python.org/en/latest/specifications/direct-url.
     """
+    checkout = Path(str(installed.locate_file("")))
+    if (checkout / "pyproject.toml").is_file():  # on the path of modules: its metadata are not an installation's
+        return checkout
     text = installed.read_text("direct_url.json")
     origin = json.loads(text) if text else {}
     if not origin.get("dir_info", {}).get("editable"):
