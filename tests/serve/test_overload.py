@@ -675,14 +675,15 @@ def _rss() -> int:
     return int(psutil.Process().memory_info().rss)
 
 
-def _keyed_stream(replica: KeyedReplica, token: str) -> Stream:
-    own = replica.own
-    headers = {"authorization": f"Bearer {token}"}
-    return Stream(urlsplit("http://127.0.0.1"), own.address.port, own.address.path, 10, headers)
+def _keyed_stream(replica: KeyedReplica, token: str, path: str = "own") -> Stream:
+    """A WebSocket at the replica's own port, or at a path of its HTTP port."""
+    own = replica.own.address
+    port, path = (own.port, own.path) if path == "own" else (replica.port, path)
+    return Stream(urlsplit("http://127.0.0.1"), port, path, 10, {"authorization": f"Bearer {token}"})
 
 
-def _part(client: Stream, size: int) -> None:
-    """Send all but the last byte of a message of that size, as far as the server reads it."""
+def _part(client: Stream, size: int) -> int:
+    """Send all but the last byte of a message of that size, as far as the server reads it; return the bytes left."""
     connection = client._socket
     connection.setblocking(False)
     data = memoryview(bytes([0x82, 0x80 | 127]) + struct.pack(">Q", size) + bytes(4) + bytes(size - 1))
@@ -690,6 +691,7 @@ def _part(client: Stream, size: int) -> None:
     with contextlib.suppress(OSError):  # the server reads no more
         while data:
             data = data[connection.send(data) :]
+    return len(data)
 
 
 def test_parts_of_messages_of_a_key_are_bounded_by_its_rate(replica: KeyedReplica) -> None:
@@ -741,6 +743,23 @@ def test_a_key_over_its_rate_is_read_on_none_of_its_connections(replica: KeyedRe
     with pytest.raises(InvalidStatus, match="429"):
         _keyed_stream(replica, visitor.token)
     first.close(), second.close()
+
+
+@pytest.mark.parametrize("path", ["own", "/v1/stream", "/openpi", "/roboarena", "/vla-eval"])
+def test_the_messages_of_a_key_over_its_rate_stay_unread(
+    replica: KeyedReplica, monkeypatch: pytest.MonkeyPatch, path: str
+) -> None:
+    """Reading them would take time from robots, and memory until they are refused."""
+    monkeypatch.setattr(api_keys, "_THROTTLED_S", (5.0, 5.0))
+    visitor = replica.visitor("right")
+    client = _keyed_stream(replica, visitor.token, path)
+    replica.known.change(visitor.name, rate=1e-6)
+    caller = replica.known.keys.check(visitor.token, "app")
+    caller.admit()
+    with pytest.raises(TooManyRequests):
+        caller.admit()
+    assert _part(client, STREAM_BYTES) > STREAM_BYTES / 4, "the kernel's buffers hold 10 MB"
+    client.close()
 
 
 def test_an_act_in_compact_form_is_read_again_after_a_refusal(replica: KeyedReplica) -> None:

@@ -38,7 +38,7 @@ from vlagents_ray.client.connection import Connection
 from vlagents_ray.client.credentials import Credentials
 from vlagents_ray.client.transports.base import CodecChoice
 from vlagents_ray.client.transports.shm import ShmTransport
-from vlagents_ray.errors import BY_CODE, VLAgentsError
+from vlagents_ray.errors import BY_CODE, TooManyRequests, VLAgentsError
 from vlagents_ray.interface import Act, Agent, Obs
 from vlagents_ray.protocol.frames import decode_replies, encode_requests
 from vlagents_ray.protocol.messages import (
@@ -56,6 +56,7 @@ from vlagents_ray.serve.config.dialects import DialectArgs
 from vlagents_ray.serve.dialects.base import GatewayContext, ReplicaContext, dialect_routes
 from vlagents_ray.serve.endpoints import access_middleware, websocket
 from vlagents_ray.serve.endpoints.access_middleware import AccessMiddleware
+from vlagents_ray.serve.endpoints.front import FrontMiddleware
 from vlagents_ray.serve.endpoints.http import build_http_app
 from vlagents_ray.serve.endpoints.shm import ShmServer
 from vlagents_ray.serve.endpoints.websocket import WebSocketServer
@@ -138,7 +139,8 @@ class Visitor:
         self.replica.known.change(self.name, **changes[self.credential])
         for keys in (self.replica.known.keys, self.replica.at_gateway):
             if self.credential == "over its rate":
-                keys.check(self.token, "app").admit()
+                with contextlib.suppress(TooManyRequests):  # the end of a refused WebSocket has been charged to it
+                    keys.check(self.token, "app").admit()
             if self.credential == "over its sessions":
                 keys.hold(self.name, 1, None)
         if self.credential == "over its sessions":
@@ -150,6 +152,7 @@ class KeyedReplica:
 
     def __init__(self, stack: contextlib.ExitStack, patch: pytest.MonkeyPatch, folder: Path) -> None:
         patch.setattr(api_keys, "_CHECK_S", 0.0)
+        patch.setattr(api_keys, "_WAIT_S", 60.0)  # of a busy machine: each test changes keys, and needs them changed
         patch.setattr(access_middleware, "_TICK_S", 0.02)
         patch.setattr(periodic.each_half_second, "_period_s", 0.02)
         self.known = ChangingKeys()
@@ -172,7 +175,8 @@ class KeyedReplica:
         others = [*weights_routes(_Receiving(self), 30.0, open_to_network=False), *live]
         inside = build_http_app(self.engine, lambda: METADATA, LIMITS, more=[*routes, *others])
         self.routes = inside.routes
-        self.port = stack.enter_context(served(AccessMiddleware(inside, self.known.keys, "app")))
+        with_access = AccessMiddleware(inside, self.known.keys, "app", admission=self.engine.admission)
+        self.port = stack.enter_context(served(FrontMiddleware(with_access)))
         check = partial(self.at_gateway.check, app="app")
         self.gr00t = {near: self._on_own_port(stack, "gr00t", near, check) for near in (True, False)}
         self.vlagents = self._on_own_port(stack, "vlagents", False, check, without_key=True)

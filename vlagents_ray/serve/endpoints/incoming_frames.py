@@ -5,6 +5,7 @@ message, inflates compressed ones, and parses and answers control frames; and Se
 uvicorn at once, whether or not the application reads it. `IncomingFrames` therefore passes bytes on to uvicorn only
 
 - as long as few messages wait for the application,
+- as long as the client's key is within its rate, as its messages would only wait to be refused,
 - if the memory in flight has room for the messages that wait, and for the one that arrives, and
 - if control frames and small fragments are rare.
 """
@@ -63,6 +64,7 @@ class IncomingFrames(asyncio.Protocol):
         self._arriving_since: float | None = None  # time since which a part of a message or frame waits for its rest, s
         self._ended = False
         self._caller: Caller | None = None
+        self._end_of_throttling: asyncio.TimerHandle | None = None  # None while the key is within its rate
         self._memory: ArrivingBytes | None = None
         transport.pause_reading()
         transport.set_protocol(self)
@@ -158,8 +160,23 @@ class IncomingFrames(asyncio.Protocol):
         if not self._ended:
             self._pass_on()
 
+    def _is_paused(self) -> bool:
+        """Return whether the server must not read now; a key over its rate is read again when its pause is over."""
+        if self._end_of_throttling is not None or len(self._waiting) >= _WAITING_MESSAGES:
+            return True
+        wait_s = 0.0 if self._caller is None else self._caller.throttled_s()
+        if wait_s <= 0:
+            return False
+        self._end_of_throttling = self._loop.call_later(wait_s, self._unthrottle)
+        return True
+
+    def _unthrottle(self) -> None:
+        self._end_of_throttling = None
+        if not self._ended:
+            self._pass_on()
+
     def _pass_on(self) -> None:
-        while self._unparsed and not self._ended and len(self._waiting) < _WAITING_MESSAGES:
+        while self._unparsed and not self._ended and not self._is_paused():
             if not self._frame_left and not self._begin_frame():
                 break
             part, self._unparsed = self._unparsed[: self._frame_left], self._unparsed[self._frame_left :]
@@ -211,13 +228,13 @@ class IncomingFrames(asyncio.Protocol):
             return
         if self._memory is not None:
             self._memory.resize(self._partial_bytes + sum(self._waiting))
-        full = len(self._waiting) >= _WAITING_MESSAGES
-        if full:
+        is_paused = self._is_paused()
+        if is_paused:
             self._transport.pause_reading()
         elif not self._protocol.read_paused:  # otherwise uvicorn resumes when its own queue is empty
             self._transport.resume_reading()
         is_arriving = bool(self._partial_bytes or self._frame_left or self._unparsed)
-        if full or not is_arriving:
+        if is_paused or not is_arriving:
             self._arriving_since = None
         elif self._arriving_since is None:
             self._arriving_since = time.monotonic()
@@ -244,6 +261,8 @@ class IncomingFrames(asyncio.Protocol):
 
     def _end_reading(self) -> None:
         self._ended = True
+        if self._end_of_throttling is not None:
+            self._end_of_throttling.cancel()
         self._unparsed, self._partial_bytes, self._arriving_since = b"", 0, None
         self._waiting.clear()
         if self._memory is not None:
