@@ -66,9 +66,16 @@ def pytest_addoption(parser: pytest.Parser) -> None:
 
 
 def pytest_configure(config: pytest.Config) -> None:
+    # Under `nohup`, this process and each program that a test starts ignore hangups, which tests send. A program
+    # inherits SIG_IGN, but no handler. The processes of pytest-xdist inherit SIG_IGN, and set the handler themselves.
+    if signal.getsignal(signal.SIGHUP) is signal.SIG_IGN and not config.getoption("numprocesses", None):
+        signal.signal(signal.SIGHUP, _ignore_hangup)
     if config.getoption("--verified"):
         config.pluginmanager.register(VerifyingTests())
         config.pluginmanager.register(RunPrograms())
+
+
+def _ignore_hangup(*_: object) -> None: ...
 
 
 def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool | None:

@@ -278,10 +278,8 @@ sys.exit(command.main(sys.argv[1:]))
 @pytest.mark.parametrize("wish", [signal.SIGTERM, signal.SIGHUP, signal.SIGINT])
 def test_the_command_stops_the_robot_when_it_is_told_to_end(wish: signal.Signals) -> None:
     code = """
-import signal, time
+import time
 import vlagents_ray.cli.robot as command
-
-signal.signal(signal.SIGHUP, signal.SIG_DFL)  # nohup, under which the tests may run, has it ignored
 
 def run(options):
     try:
