@@ -22,11 +22,11 @@ import numpy as np
 from vlagents_ray import Act, ActionSpec, Agent, ChunkPlayer, Contract, Obs
 from vlagents_ray.images.jpeg_png import encode_jpeg
 from vlagents_ray.robot import Guard
-from vlagents_ray.robot.ros import RosRobot
-from vlagents_ray.robot.ros.links import Ros2
-from vlagents_ray.robot.ros.robot import settings_from
+from vlagents_ray_robot.ros import RosRobot
+from vlagents_ray_robot.ros.links import Ros2
+from vlagents_ray_robot.ros.robot import settings_from
 
-sys.path.insert(0, str(Path(__file__).parents[1] / "tests/support"))
+sys.path.insert(0, str(Path(__file__).parents[1] / "plugins/vlagents_ray_robot/tests/support"))
 
 IMAGE, COMMANDS = "/camera/image_raw", "/arm/commands"
 Publish = Callable[[str, dict[str, Any]], object]

@@ -9,9 +9,13 @@ from pathlib import Path
 import pytest
 
 from vlagents_ray import registry
+from vlagents_ray.cli import doctor, robot
 from vlagents_ray.cli.listing import policies_and_wrappers
+from vlagents_ray.cli.main import app
 from vlagents_ray.errors import ConfigError, UnknownEnv, UnknownPolicy
 from vlagents_ray.registry import entries, find_entry, names, not_installed, plugin_distributions
+from vlagents_ray.robot.leaders import leader_named
+from vlagents_ray.robot.loop import robot_named
 
 Install = Callable[..., None]
 
@@ -154,3 +158,112 @@ def test_all_plugins_of_this_repository_are_installed_for_its_tests() -> None:
         assert not_installed(kind) == {}, "make setup"
         for name in names(kind):
             assert find_entry(kind, name) is not None
+
+
+ROBOTS = """
+class Arm:
+    def __init__(self, name):
+        self.name = name
+
+    observe = apply = stop = lambda *_: None
+
+
+class Lamp:
+    def __init__(self, name): ...
+
+
+class Pedal:
+    help = "press it"
+
+    def __init__(self, step):
+        self.step, self.open = step, True
+
+    def __enter__(self):
+        return self
+
+    def __exit__(self, *_):
+        self.open = False
+
+    def engaged(self):
+        return False
+
+    def action(self, obs): ...
+
+
+def open_pedal(contract, *, step, measure):
+    return Pedal(step)
+
+
+def inspect(arguments):
+    print("inspecting", *arguments)
+    return 7
+"""
+ROBOT_REGISTRY = """
+ARM = RegistryEntry("lab_policies.robots:Arm", "the arm of the lab", tasks=":<name>")
+LAMP = RegistryEntry("lab_policies.robots:Lamp")
+PEDAL = RegistryEntry("lab_policies.robots:open_pedal", "a pedal")
+INSPECT = RegistryEntry("lab_policies.robots:inspect", "Inspect the arm.")
+"""
+
+
+@pytest.fixture
+def lab(install: Install, tmp_path: Path) -> None:
+    """Install a distribution with a robot, a leader and a subcommand of `vlagents-ray robot`."""
+    (tmp_path / "lab_policies" / "robots.py").write_text(ROBOTS)
+    with (tmp_path / "lab_policies" / "registry.py").open("a") as file:
+        file.write(ROBOT_REGISTRY)
+    install(
+        "lab-robots",
+        robots="arm = lab_policies.registry:ARM\nlamp = lab_policies.registry:LAMP",
+        leaders="pedal = lab_policies.registry:PEDAL",
+        commands="robot.inspect = lab_policies.registry:INSPECT",
+    )
+
+
+@pytest.mark.usefixtures("lab")
+def test_a_robot_of_a_plugin_is_made_by_its_name_with_the_text_after_the_colon() -> None:
+    assert vars(robot_named("--robot", "arm:left")()) == {"name": "left"}
+    with pytest.raises(ConfigError, match="--robot lamp:left: lacks observe, apply, stop; want a class with observe"):
+        robot_named("--robot", "lamp:left")
+
+
+@pytest.mark.usefixtures("lab")
+def test_a_leader_of_a_plugin_is_opened_by_its_name_and_closed() -> None:
+    with leader_named("--leader", "pedal")(None, step=0.5, measure=None) as leader:
+        assert (leader.step, leader.open) == (0.5, True)  # type: ignore[attr-defined]
+    assert not leader.open  # type: ignore[attr-defined]
+
+
+@pytest.mark.usefixtures("lab")
+def test_a_subcommand_of_a_plugin_gets_its_arguments_and_is_no_command_of_its_own(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    assert robot.main(["inspect", "arm:left", "--fast"]) == 7
+    assert capsys.readouterr().out == "inspecting arm:left --fast\n"
+    with pytest.raises(SystemExit):
+        robot.main(["--help"])
+    listed = capsys.readouterr().out
+    assert "  inspect               Inspect the arm." in listed
+    assert "  arm:<name>            the arm of the lab" in listed
+    assert "  pedal                 a pedal" in listed
+    assert not [command.name for command in app.registered_commands if "." in str(command.name)]
+
+
+def test_a_robot_a_leader_and_a_subcommand_that_are_not_installed_name_their_distribution(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    published = {"robots": {"crane": "vlagents-ray-cranes"}, "leaders": {"wheel": "vlagents-ray-cranes"}}
+    published["commands"] = {"robot.lift": "vlagents-ray-cranes"}
+    monkeypatch.setattr(registry, "published", lambda: published)
+    with pytest.raises(ConfigError, match="robot 'crane' is in vlagents-ray-cranes, which is not installed: pip inst"):
+        robot_named("--robot", "crane:4")
+    with pytest.raises(ConfigError, match="leader 'wheel' is in vlagents-ray-cranes, which is not installed"):
+        leader_named("--leader", "wheel")
+    assert robot.main(["lift", "crane:4"]) == 2
+    error = capsys.readouterr().err
+    assert error.startswith("ConfigError: command 'robot lift' is in vlagents-ray-cranes, which is not installed: pip ")
+    with pytest.raises(SystemExit):
+        robot.main(["--help"])
+    assert "  crane                 not installed: pip install vlagents-ray-cranes" in capsys.readouterr().out
+    monkeypatch.setattr(doctor, "published", lambda: published)
+    assert doctor.plugins().detail.endswith("; not installed: vlagents-ray-cranes")

@@ -19,10 +19,10 @@ from vlagents_ray import ConfigError
 from vlagents_ray.cli.main import app
 from vlagents_ray.cli.options import parse_settings, read_run_file
 from vlagents_ray.robot.limits import Limits
-from vlagents_ray.robot.ros.robot import read_settings
 from vlagents_ray.serve.access.key_store import read_keys
 from vlagents_ray.serve.launch.deployment_file import read_deployment
 from vlagents_ray.yaml_text import load_yaml
+from vlagents_ray_robot.ros.robot import read_settings
 
 TEXTS = st.text(st.characters(codec="ascii", exclude_categories=("C",)), max_size=6)
 VALUES = st.recursive(

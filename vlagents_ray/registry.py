@@ -1,9 +1,9 @@
-"""Names of policies, wrappers, environments, dialects and commands, the location of their code, and their requirements.
+"""Names of policies, environments, robots, commands and others, the location of their code, and their requirements.
 
 A name leads to a `RegistryEntry`, whose class is imported only when it is used. Plug-ins add entries through the
-entry-point groups `vlagents_ray.policies`, `.wrappers`, `.envs`, `.dialects`, `.commands` and `.replica`: an entry
-point names a `RegistryEntry` in a module that imports nothing large. A `"module:Class"` in a deployment file works
-without registration. Wrappers change the observations of any policy, or its actions.
+entry-point groups `vlagents_ray.policies`, `.wrappers`, `.envs`, `.dialects`, `.robots`, `.leaders`, `.commands` and
+`.replica`: an entry point names a `RegistryEntry` in a module that imports nothing large. A `"module:Class"` in a
+deployment file works without registration. Wrappers change the observations of any policy, or its actions.
 
 The tables of README and docs/ are made from these entries: `python tests/support/tables.py`.
 """
@@ -32,9 +32,12 @@ CORE = "vlagents-ray"  # the distribution of this package
 
 @dataclass(frozen=True, slots=True)
 class RegistryEntry:
-    """A policy, wrapper, environment, dialect or command: where its code is, what it is, and what it needs."""
+    """A policy, wrapper, environment, dialect, robot or command: where its code is, what it is, and what it needs."""
 
-    target: str  # "module:Class"; of a command, "module:function" or "module:app", a typer.Typer
+    # "module:Class". Of a leader, "module:function" (see `robot.leaders.OpenLeader`). Of a command, "module:function"
+    # or "module:app", a typer.Typer; the function of a subcommand, such as "robot.check", takes the arguments and
+    # returns the exit status.
+    target: str
     # Its models or tasks, for the tables of README and docs/; empty: no row in them. Of a command, one line for --help.
     about: str = ""
     needs: tuple[str, ...] = ()  # import names; the first one may be in a source named by `checkouts`
@@ -42,7 +45,7 @@ class RegistryEntry:
     extra: str | None = None  # extra of its distribution that installs them
     checkouts: tuple[str, ...] = ()  # variables, one of which names a checkout of the authors' code
     wants: str = ""  # further requirements of its users, such as "assets"
-    tasks: str = "/<task>"  # of an environment: the pattern after its name
+    tasks: str = "/<task>"  # of an environment or a robot: the pattern after its name
     deployment: str | None = None  # file of deployments/ with its settings; None: its own name
     weights: bool = False  # whether a checkout has weights of it, which deployments/NAME.yaml names
     # A URL, or "page#section" below docs/policies or docs/benchmarks; "": no page; None: the page of its own name.
@@ -177,7 +180,9 @@ _BUILT_IN: dict[str, dict[str, RegistryEntry]] = {
     "wrappers": WRAPPERS,
     "envs": ENVS,
     "dialects": {},  # other systems' protocols, the names under `dialects` in a deployment file
-    "commands": {},  # those of this package are in `cli.main`
+    "robots": {},  # the names before the colon of `vlagents-ray robot --robot NAME:ARGUMENT`
+    "leaders": {},  # operators' devices, `vlagents-ray robot --leader NAME`
+    "commands": {},  # those of this package are in `cli.main`; "robot.NAME" is a subcommand of `vlagents-ray robot`
     "replica": {},  # parts of a replica
 }
 _SINGULAR = {
@@ -185,6 +190,8 @@ _SINGULAR = {
     "wrappers": "wrapper",
     "envs": "environment",
     "dialects": "dialect",
+    "robots": "robot",
+    "leaders": "leader",
     "commands": "command",
     "replica": "part of a replica",
 }
@@ -204,19 +211,15 @@ _EXTRAS: dict[str, tuple[str, ...]] = {
         "rich",
         "grpc",
     ),
-    "arms": ("mujoco_menagerie",),
     "bench": ("matplotlib",),
     "sim": ("gymnasium",),
     "record": ("av", "pyarrow"),
-    "spacemouse": ("pyspacemouse",),
     "otel": ("opentelemetry",),
     **{name: (name,) for name in ("wandb", "trackio", "tensorboard", "rerun")},
 }
 
 # import name -> how to install a package that is in no extra and no file of requirements/
 _ELSEWHERE = {
-    "rclpy": "source the setup file of ROS 2 (`. /opt/ros/jazzy/setup.bash`) and start its Python, or reach ROS "
-    "through a rosbridge, `link: ws://arm-pc:9090`",
     "torchao": "run `pip install torchao` in the policy's environment; its requirements file leaves it out",
 }
 # packages installed as dependencies of those of the families
@@ -281,7 +284,7 @@ def pip_install(extra: str | None = None, distribution: str = CORE) -> str:
 
 
 def names(kind: str) -> list[str]:
-    """Return all names of a kind ("policies", "wrappers", "envs", "dialects", "commands"), this package's own first."""
+    """Return all names of a kind, such as "policies" or "robots", this package's own first."""
     built_in = _BUILT_IN[kind]
     return [*built_in, *sorted(name for name in _entry_points(kind) if name not in built_in)]
 
@@ -415,6 +418,16 @@ def _is_class(name: str) -> bool:
 
 def registered_class(kind: str, name: str, unknown: type[ConfigError] = ConfigError) -> type[Any]:
     """Return the class registered as `name`, or given as "module:Class"; raises `unknown` if there is none."""
+    return named_class(_importable_target(kind, name, unknown), unknown)
+
+
+def registered_function(kind: str, name: str) -> Any:
+    """Return the function registered as `name`, or "module:function"; raises `ConfigError` if there is none."""
+    return load_target(_importable_target(kind, name, ConfigError))
+
+
+def _importable_target(kind: str, name: str, unknown: type[ConfigError]) -> str:
+    """Return the target of a registered name, whose plug-in can be imported; "module:NAME" is returned unchanged."""
     entry = find_entry(kind, name)
     if entry is not None and entry.distribution != CORE:
         _require_importable(kind, name, entry)
@@ -423,14 +436,14 @@ def registered_class(kind: str, name: str, unknown: type[ConfigError] = ConfigEr
         distribution = not_installed(kind).get(name)
         if distribution is not None:
             raise unknown(
-                f"{_SINGULAR[kind]} {name!r} is in {distribution}, which is not installed: "
+                f"{_SINGULAR[kind]} {_shown(kind, name)!r} is in {distribution}, which is not installed: "
                 f"{pip_install(distribution=distribution)}"
             )
         known = names(kind)
         raise unknown(
             f"{name!r} is not registered: want one of {sorted(known)}, or 'module:Class'{did_you_mean(name, known)}"
         )
-    return named_class(target, unknown)
+    return target
 
 
 def load_command(name: str) -> Any:
@@ -439,11 +452,12 @@ def load_command(name: str) -> Any:
     Raises:
         ConfigError: It cannot be loaded, for whatever reason; the message names the plug-in.
     """
-    entry = find_entry("commands", name)
-    if entry is None:
-        raise ConfigError(f"command {name!r} is not registered: want one of {names('commands')}")
-    _require_importable("commands", name, entry)
-    return load_target(entry.target)
+    return registered_function("commands", name)
+
+
+def _shown(kind: str, name: str) -> str:
+    """Return a name as a user types it: the subcommand "robot.check" is `vlagents-ray robot check`."""
+    return name.replace(".", " ") if kind == "commands" else name
 
 
 def _require_importable(kind: str, name: str, entry: RegistryEntry) -> None:
@@ -458,7 +472,8 @@ def _require_importable(kind: str, name: str, entry: RegistryEntry) -> None:
     except ModuleNotFoundError:
         return  # `load_target` says what is not installed
     except Exception as error:
-        raise ConfigError(f"{_SINGULAR[kind]} {name!r} of {entry.distribution} cannot be loaded: {error}") from error
+        shown = f"{_SINGULAR[kind]} {_shown(kind, name)!r}"
+        raise ConfigError(f"{shown} of {entry.distribution} cannot be loaded: {error}") from error
 
 
 def named_class(name: str, unknown: type[ConfigError] = ConfigError) -> type[Any]:

@@ -1,6 +1,6 @@
-"""Test suites for policies, environments and robots, which all those of this package pass and yours can also use.
+"""Test suites for policies and environments, which all those of this package pass and yours can also use.
 
-    from vlagents_ray.testing import check_agent, check_env, check_robot
+    from vlagents_ray.testing import check_agent, check_env
 
     def test_my_env_keeps_its_contract():
         check_env(MyEnv())
@@ -8,11 +8,7 @@
     def test_my_policy_keeps_its_contract():
         check_agent(MyPolicy())
 
-    def test_my_robot_keeps_its_contract():
-        check_robot(MyArm())  # moves nothing; with operator=… it makes small moves
-
-Each raises `ContractViolation`, the first two with the first violation that they find, and they close the agent or
-environment.
+Each raises `ContractViolation` with the first violation that it finds, and closes the agent or environment.
 """
 
 from __future__ import annotations
@@ -34,11 +30,9 @@ from vlagents_ray.contract import CameraSpec, Contract, StateSpec
 from vlagents_ray.envs.base import EvalEnv, kind_of
 from vlagents_ray.errors import InvalidAction, InvalidObservation, VLAgentsError
 from vlagents_ray.interface import Act, Agent, Obs
-from vlagents_ray.robot.check import RobotReport, examine
-from vlagents_ray.robot.loop import Robot
 from vlagents_ray.validation import check_action, check_observation
 
-__all__ = ["ContractViolation", "check_agent", "check_env", "check_robot"]
+__all__ = ["ContractViolation", "check_agent", "check_env"]
 
 _SCALARS = (bool, int, float, str, bytes)
 _SIDE = 64  # px, of a random image whose size the contract does not state
@@ -364,25 +358,6 @@ def random_observation(
         gripper=float(rng.uniform()),
         state={name: rng.uniform(-1, 1, size).astype(np.float32) for name, size in sizes.items()},
     )
-
-
-def check_robot(robot: Robot, **options: Any) -> RobotReport:
-    """Check that a robot implements `observe`, `apply` and `stop`, and that its readings are right.
-
-    Args:
-        robot: The robot.
-        options: Those of `vlagents_ray.robot.check.examine`. Without an `operator` nothing moves.
-
-    Returns:
-        The report, with the checks that were not made.
-
-    Raises:
-        ContractViolation: A check found something; the message has every finding.
-    """
-    report = examine(robot, **options)
-    if not report.ok:
-        raise ContractViolation("\n".join(map(str, report.findings)))
-    return report
 
 
 def check_env(

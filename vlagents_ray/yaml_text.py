@@ -8,24 +8,25 @@ from pathlib import Path
 from typing import Any
 
 from vlagents_ray.errors import ConfigError
-from vlagents_ray.registry import require
+from vlagents_ray.registry import CORE, require
 
 # YAML 1.1 reads only `1.0e+12` as a number, and `1e12` as text; YAML 1.2 and JSON read both as numbers.
 _FLOAT = re.compile(r"[-+]?(\.[0-9]+|[0-9]+(\.[0-9]*)?)[eE][-+]?[0-9]+")
 
 
-def load_yaml(text: str, *, extra: str = "serve") -> Any:
+def load_yaml(text: str, *, extra: str = "serve", distribution: str = CORE) -> Any:
     """Return the document in a text.
 
     Args:
         text: YAML.
-        extra: The extra of this package to install if PyYAML is missing.
+        extra: The extra to install if PyYAML is missing.
+        distribution: The distribution of that extra.
 
     Raises:
         ValueError: The text is not YAML, or has a key twice in one mapping.
         MissingDependency: PyYAML is not installed.
     """
-    yaml = require("yaml", extra=extra)
+    yaml = require("yaml", extra=extra, distribution=distribution)
     try:
         return yaml.load(text, Loader=_loader(yaml))
     except yaml.YAMLError as error:

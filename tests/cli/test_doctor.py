@@ -46,7 +46,7 @@ def test_every_check_gives_a_row_of_its_own_and_none_breaks() -> None:
     found = list(doctor.checks(port=0))
     rows = [row for _, row in found]
     names = [name for name, _ in found]
-    for expected in ("Python", "Ray", "HAProxy", "GPU", "Vulkan", "EGL", "shared memory", "open files"):
+    for expected in ("Python", "Ray", "plug-ins", "HAProxy", "GPU", "Vulkan", "EGL", "shared memory", "open files"):
         assert names.count(expected) == 1
     assert [row for row in rows if "the check itself broke" in row.detail] == []
     assert [row for row in rows if row.status != "ok" and not row.cure] == []

@@ -233,7 +233,7 @@ def test_with_a_keyboard_as_leader_each_key_has_one_consumer_and_enter_restarts_
 import sys
 import vlagents_ray.cli.robot as command
 from vlagents_ray import Act, ActionSpec, Agent, Contract
-from vlagents_ray.robot.teleoperation import Keyboard
+import vlagents_ray_robot.teleoperation as teleoperation
 import numpy as np
 
 class Still(Agent):
@@ -245,7 +245,7 @@ class Still(Agent):
     def act(self, obs):
         return Act(np.zeros(6, np.float32))
 
-class Seen(Keyboard):
+class Seen(teleoperation.Keyboard):
     def _press(self, key):
         taken = super()._press(key)
         print("keyboard", repr(key), taken, flush=True)
@@ -257,7 +257,7 @@ class Stopped(command.Watchdog):
         self.trip("a person is in the way")
 
 import vlagents_ray.robot.loop as loop
-command.RemoteAgent, loop.Watchdog, command._DEVICES["keyboard"] = Still, Stopped, Seen
+command.RemoteAgent, loop.Watchdog, teleoperation.Keyboard = Still, Stopped, Seen
 sys.exit(command.main(sys.argv[1:]))
 """
     options = ["http://gpu-box:8000", "--leader", "keyboard", "--step", "0.01"]
@@ -600,8 +600,8 @@ ARM = ["--robot", SIMULATED]
         (["--limits", "{folder}"], "limits"),
         (["--limits", "/nowhere.yaml"], "nowhere"),
         (["--trained-on", "{folder}", *ARM], "statistics"),
-        (["--ros", "{folder}"], "cannot be read as a file of ROS topics"),
-        (["--ros", "/nowhere.yaml"], "cannot be read as a file of ROS topics"),
+        (["--robot", "ros:{folder}"], "cannot be read as a file of ROS topics"),
+        (["--robot", "ros:/nowhere.yaml"], "cannot be read as a file of ROS topics"),
         ([*ARM, "--robot-set", "foo=1"], "unexpected keyword argument 'foo'; it takes"),
         ([*ARM, "--robot-set", "foo"], "want KEY=VALUE"),
         (["--robot", "{here}:FaultyArm", "--robot-set", "port=/dev/x"], "could not be made: OSError: .*port /dev/x"),

@@ -16,8 +16,13 @@ import vlagents_ray
 from vlagents_ray.errors import shown
 
 PACKAGE = Path(vlagents_ray.__file__).parent
-FROM_THE_NETWORK = ("protocol", "wire", "serve", "images", "weights", "robot/ros")
-ERRORS = ("error", "full")  # names of exceptions, whose texts are bounded already
+PLUGINS = PACKAGE.parent / "plugins"
+FROM_THE_NETWORK = (
+    *(PACKAGE / folder for folder in ("protocol", "wire", "serve", "images", "weights")),
+    PLUGINS / "vlagents_ray_dialects/vlagents_ray_dialects",
+    PLUGINS / "vlagents_ray_robot/vlagents_ray_robot/ros",
+)
+ERRORS = ("error", "full", "problem")  # names of exceptions, whose texts are bounded already
 
 ARRAY = np.random.default_rng(0).random(1000)
 VALUES = st.recursive(
@@ -96,7 +101,8 @@ def _cut_after_it_was_written(path: Path) -> Iterator[int]:
 
 
 def test_no_value_of_the_network_is_written_before_it_is_cut(tmp_path: Path) -> None:
-    files = [file for folder in FROM_THE_NETWORK for file in (PACKAGE / folder).rglob("*.py")]
+    assert all(folder.is_dir() for folder in FROM_THE_NETWORK)
+    files = [file for folder in FROM_THE_NETWORK for file in folder.rglob("*.py")]
     assert [f"{file}:{line}" for file in files for line in _cut_after_it_was_written(file)] == []
     wrong = tmp_path / "wrong.py"
     wrong.write_text('str(x)[:40]\nf"{x!r:.80}"\nrepr(x)[:3]\nf"{str(a.b)[:4]!r}"\nstr(error)[:80]\nf"{x:.3f}"\n')

@@ -14,7 +14,6 @@ from vlagents_ray.errors import PolicyUnavailable
 from vlagents_ray.interface import SAFE
 from vlagents_ray.robot import Guard, Limits, run_loop
 from vlagents_ray.robot.simulated import SimulatedRobot
-from vlagents_ray.robot.teleoperation import AxesDevice, AxesLeader
 
 HZ = 50.0
 OPEN, CLOSED = 1.0, -1.0
@@ -59,9 +58,8 @@ UNEQUAL = ActionSpec(dim=15, delta=True, gripper_open=1.0, gripper_closed=0.0, a
         lambda: neutral(UNEQUAL),
         lambda: Guard(Contract(action=UNEQUAL)),
         lambda: SimulatedRobot(Contract(action=UNEQUAL)),
-        lambda: AxesLeader(Contract(action=UNEQUAL), Device(), step=0.1),
     ],
-    ids=["safe action", "neutral action", "guard", "simulated robot", "leader"],
+    ids=["safe action", "neutral action", "guard", "simulated robot"],
 )
 def test_arms_that_do_not_share_the_numbers_equally_are_an_error_of_each_user(use) -> None:  # type: ignore[no-untyped-def]
     with pytest.raises(ConfigError, match="2 arms"):
@@ -191,37 +189,6 @@ def test_the_way_to_rest_keeps_the_grippers(arms: int) -> None:
     columns = spec.gripper_columns(4 * arms)
     assert (way[:, columns] == last[columns]).all()
     assert np.allclose(np.delete(way[-1], columns), (0.1, 0.2, 0.3) * arms)
-
-
-class Device(AxesDevice):
-    def __init__(self) -> None:
-        self.moves = np.zeros(6, np.float32)
-
-    def engaged(self) -> bool:
-        return True
-
-    def axes(self) -> np.ndarray:
-        return self.moves
-
-    def press(self) -> None:
-        self._presses += 1
-
-
-@pytest.mark.parametrize("delta", [False, True])
-def test_a_leader_moves_the_gripper_at_a_press_alone_and_refuses_several(delta: bool) -> None:
-    device = Device()
-    leader = AxesLeader(Contract(action=spec_of(delta, 1)), device, step=0.1)
-    obs = Obs(state={"joints": np.zeros(3, np.float32)}, gripper=0.3)
-    leader.engaged()
-    device.moves = np.ones(6, np.float32)
-    assert {float(leader.action(obs)[3]) for _ in range(5)} == {CLOSED}
-    device.press()
-    assert {float(leader.action(obs)[3]) for _ in range(5)} == {OPEN}
-    with pytest.raises(ConfigError, match=r"at most one gripper, got the columns \[3, 7\]"):
-        AxesLeader(Contract(action=spec_of(delta, 2)), device, step=0.1)
-    half = ActionSpec(dim=4, delta=delta, gripper_open=1.0)
-    with pytest.raises(ConfigError, match="both `gripper_open` and `gripper_closed`"):
-        AxesLeader(Contract(action=half), device, step=0.1)
 
 
 @pytest.mark.parametrize(("delta", "arms"), KINDS)

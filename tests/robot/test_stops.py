@@ -16,6 +16,7 @@ from vlagents_ray.interface import Act, Agent, Obs
 from vlagents_ray.robot.loop import run_loop
 from vlagents_ray.robot.record import Recorder
 from vlagents_ray.robot.safety import Watchdog
+from vlagents_ray.robot.simulated import SimulatedRobot
 
 
 class Arm:
@@ -174,3 +175,21 @@ def test_a_pause_that_ends_between_the_players_decision_and_the_loops_moves_noth
     with Resumed(Steady(), PlayerSettings(deadline_s=1.0)) as player:
         report = run_loop(arm, player, hz=200.0, until=lambda: arm.ticks > 6)
     assert (report.paused, applied(arm)) == (6, [])
+
+
+@pytest.mark.parametrize("delta", [False, True])
+@pytest.mark.parametrize("arms", [None, ("left", "right")])
+def test_a_simulated_robot_stops_where_it_is_and_keeps_its_grasp(delta: bool, arms: tuple[str, ...] | None) -> None:
+    dim = 3 * len(arms or ("",))
+    spec = ActionSpec(dim=dim, delta=delta, gripper_open=1.0, gripper_closed=0.0, arms=arms)
+    robot = SimulatedRobot(Contract(action=spec))
+    robot.apply(np.full(dim, 1.0, np.float32))
+    robot.observe()
+    for _ in range(3):
+        robot.stop()
+    before = robot.observe().state["joints"]
+    for _ in range(50):
+        after = robot.observe().state["joints"]
+    grippers = spec.gripper_columns(dim)
+    assert np.allclose(np.delete(after, grippers), np.delete(before, grippers))
+    assert np.allclose(after[grippers], 1.0), "as commanded before the stop"

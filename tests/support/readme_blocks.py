@@ -32,8 +32,9 @@ from typing import Any
 from peer_environment import peers_python
 from typer.main import get_command
 
-from vlagents_ray.cli import robot, robot_check
+from vlagents_ray.cli import robot
 from vlagents_ray.cli.main import app
+from vlagents_ray_robot.check_command import command_parser as check_parser
 
 ROOT = Path(__file__).parents[2]
 DOCUMENTED_HOST = "gpu-box:8000"
@@ -201,7 +202,7 @@ def options_of(line: str) -> set[str]:
     words = line.split()
     words = words[words.index("vlagents-ray") + 1 :]
     if words[:1] == ["robot"]:
-        parsers = [robot.command_parser()[0], robot_check.command_parser()]
+        parsers = [robot.command_parser()[0], check_parser()]
         return {option for parser in parsers for action in parser._actions for option in action.option_strings}
     command = COMMAND
     while words and words[0] in getattr(command, "commands", {}):

@@ -23,13 +23,15 @@ FILE = ROOT / "tests/surface.txt"
 MODULES = (
     "vlagents_ray",
     "vlagents_ray.robot",
-    "vlagents_ray.robot.teleoperation",
+    "vlagents_ray.robot.leaders",
     "vlagents_ray.viewers",
     "vlagents_ray.testing",
     "vlagents_ray.envs",
     "vlagents_ray.evaluate",
     "vlagents_ray.evaluate.robot",
     "vlagents_ray_learn",
+    "vlagents_ray_robot.teleoperation",
+    "vlagents_ray_robot.testing",
 )
 
 
@@ -113,7 +115,7 @@ def error_codes() -> Iterator[str]:
 
 def registered() -> Iterator[str]:
     registry = importlib.import_module("vlagents_ray.registry")
-    for kind in ("policies", "wrappers", "envs", "dialects"):
+    for kind in ("policies", "wrappers", "envs", "dialects", "robots", "leaders"):
         yield f"{kind}: {', '.join(sorted(registry.names(kind)))}"
 
 

@@ -25,7 +25,7 @@ from rich.text import Text
 from vlagents_ray.cli.console import print_json, table
 from vlagents_ray.errors import ConfigError, MissingDependency
 from vlagents_ray.policies.base.accelerator import OLDEST_DRIVERS, driver_version
-from vlagents_ray.registry import require
+from vlagents_ray.registry import not_installed, plugin_distributions, published, require
 from vlagents_ray.serve.python_env.create import has_gpu
 
 if TYPE_CHECKING:
@@ -208,6 +208,7 @@ def checks(port: int = DEFAULT_PORT, pythons: Sequence[Path] = ()) -> Iterator[t
     todo: list[tuple[str, Callable[[], Check]]] = [
         ("Python", python_version),
         ("Ray", ray),
+        ("plug-ins", plugins),
         ("HAProxy", haproxy),
         ("GPU", gpu),
         ("Vulkan", vulkan),
@@ -251,6 +252,15 @@ def ray() -> Check:
     if version not in wanted:
         return Check("warn", f"{version}; this package is tested with {wanted}", cure)
     return Check("ok", version)
+
+
+def plugins() -> Check:
+    """List the installed plug-ins, and those of the project that are not installed."""
+    missing = sorted({distribution for kind in published() for distribution in not_installed(kind).values()})
+    detail = ", ".join(plugin_distributions()) or "none"
+    if missing:
+        detail += f"; not installed: {', '.join(missing)}"
+    return Check("ok", detail)
 
 
 def haproxy() -> Check:

@@ -125,6 +125,8 @@ for _commands, _name, _line in (
 def _add_commands_of_plugins() -> None:
     """Add the commands of installed plug-ins; one that cannot be imported fails when it is called."""
     for name in names("commands"):
+        if "." in name:  # a subcommand, which `cli.robot` runs
+            continue
         try:
             command, entry = load_command(name), find_entry("commands", name)
         except VLAgentsError as error:
@@ -136,6 +138,8 @@ def _add_commands_of_plugins() -> None:
         else:
             app.command(name, short_help=about, rich_help_panel=_MORE)(command)
     for name, distribution in not_installed("commands").items():
+        if "." in name:
+            continue
         cure = pip_install(distribution=distribution)
         message = f"command {name!r} is in {distribution}, which is not installed: {cure}"
         _add_failing(name, f"Not installed: {cure}.", message)

@@ -5,8 +5,6 @@ With --env a simulation is driven: by a policy, by an operator, or by a policy t
 The server's API key is read from the variable VLAGENTS_RAY_API_KEY, and the file of your own CA from
 SSL_CERT_FILE.
 
-`vlagents-ray robot check ROBOT` checks a robot before a policy moves it.
-
 Exit status: 0 if every tick had an action of the policy, 1 if not, 3 if fewer than half had, 2 if it could not run.
 """
 
@@ -23,39 +21,37 @@ from functools import partial
 from typing import Any, get_args
 
 from vlagents_ray.chunking.buffer import ENSEMBLE, MERGES, Mode
-from vlagents_ray.chunking.control import Control, Leader
+from vlagents_ray.chunking.control import Control
 from vlagents_ray.chunking.player import ChunkPlayer, PlayerSettings
 from vlagents_ray.cli.arguments import number, one_of, parse_all
 from vlagents_ray.client.agent import RemoteAgent
 from vlagents_ray.client.commands import CommandInbox
-from vlagents_ray.contract import Contract
 from vlagents_ray.errors import ConfigError, VLAgentsError, printable
 from vlagents_ray.interface import Agent
 from vlagents_ray.naming import did_you_mean
+from vlagents_ray.registry import entries, load_command, names, not_installed, pip_install
 from vlagents_ray.robot.fit import Fit, Trained
+from vlagents_ray.robot.leaders import leader_named
 from vlagents_ray.robot.limits import Limits
 from vlagents_ray.robot.loop import (
     LoopReport,
     Restart,
     Robot,
     fit_of,
-    import_class,
     opened,
     robot_named,
     robot_watchdog,
     run_loop,
 )
 from vlagents_ray.robot.record import Recorder
-from vlagents_ray.robot.ros import RosRobot, read_settings
 from vlagents_ray.robot.safety import SOFT_START_S, Guard, Watchdog, measured_state
 from vlagents_ray.robot.simulated import SimulatedRobot
-from vlagents_ray.robot.teleoperation import HELP, JOINTS_HELP, AxesLeader, Keyboard, SpaceMouse, Terminal
+from vlagents_ray.robot.terminal import typed_keys
 from vlagents_ray.viewers import open_viewer
 
 logger = logging.getLogger(__name__)
 MOSTLY_SAFE = 3  # exit status
 WAIT_S = 1.0  # deadline of a tick in the modes that wait for an answer; half of the default of --silent-s
-_DEVICES: dict[str, type[Keyboard | SpaceMouse]] = {"keyboard": Keyboard, "spacemouse": SpaceMouse}
 _HZ = 50.0  # of a robot
 _MOST_HZ = 10_000.0  # no arm and no loop in Python is faster
 _LABELS = {"y": "success", "n": "failure"}
@@ -73,11 +69,9 @@ _HEADER = ("", "ticks", "missed", "within 2 ms", "p50 ms", "p99 ms", "max ms")
 
 def main(arguments: Sequence[str]) -> int:
     """Run the command, and return its exit status."""
-    if arguments[:1] == ["check"]:
-        from vlagents_ray.cli.robot_check import main as check
-
-        with _ended_by_signals():
-            return check(arguments[1:])
+    subcommand = f"robot.{arguments[0]}" if arguments else ""
+    if subcommand in names("commands") or subcommand in not_installed("commands"):
+        return _run_subcommand(subcommand, arguments[1:])
     options = parse(arguments)
     if options.env is not None:
         from vlagents_ray.cli.simulated_robot import drive
@@ -97,6 +91,17 @@ def main(arguments: Sequence[str]) -> int:
     return 1 if report.safe_ticks else 0
 
 
+def _run_subcommand(name: str, arguments: Sequence[str]) -> int:
+    """Run a subcommand that a plug-in registers, such as "robot.check", and return its exit status."""
+    try:
+        run: Callable[[Sequence[str]], int] = load_command(name)
+    except VLAgentsError as error:
+        print(printable(f"{type(error).__name__}: {error}"), file=sys.stderr)  # noqa: T201
+        return 2
+    with _ended_by_signals():
+        return run(arguments)
+
+
 def parse(arguments: Sequence[str]) -> argparse.Namespace:
     """Parse the arguments; the process ends with status 2 if they are inconsistent."""
     parser, of_robot, of_env = command_parser()
@@ -108,10 +113,8 @@ def parse(arguments: Sequence[str]) -> argparse.Namespace:
         parser.error(f"got {', '.join(given)} with{'' if in_env else 'out'} --env; leave them out")
     if not in_env and options.policy is None:
         parser.error("got neither a URL nor --env, want one of them")
-    if options.ros is not None and options.robot is not None:
-        parser.error("got --robot besides --ros, want one of them")
     if options.robot_set and options.robot is None:
-        parser.error("got --robot-set without --robot; name the robot's class with --robot MODULE:CLASS")
+        parser.error("got --robot-set without --robot; name the robot with --robot NAME:ARGUMENT or MODULE:CLASS")
     if options.mode is None:
         options.mode = "open_loop" if in_env else "async"
     if options.mode != "async" and (options.merge != "newest" or options.rtc):
@@ -145,22 +148,25 @@ def _run(options: argparse.Namespace) -> LoopReport:
     if options.deadline_ms is not None:
         deadline_s = options.deadline_ms / 1e3
     make_robot = robot_named("--robot", options.robot, options.robot_set) if options.robot else None
-    make_leader = None
-    if ":" in (options.leader or ""):
-        make_leader = import_class("--leader", options.leader, ("engaged", "action"))
+    open_leader = leader_named("--leader", options.leader) if options.leader else None
     ended: BaseException | None = None
     report = LoopReport(hz)
     with contextlib.ExitStack() as stack:
-        topics = None if options.ros is None else stack.enter_context(RosRobot(read_settings(options.ros)))
         commands = CommandInbox() if options.operate else None
         agent = RemoteAgent(  # the player closes it
             options.policy, transport=options.transport, timeout_s=options.timeout_s, commands=commands
         )
         agent.initialize()
         contract = agent.contract
-        leader = _leader(options, make_leader, contract, stack)
+        leader = None
+        if open_leader is not None:
+            measure = measured_state(options.measure)
+            leader = stack.enter_context(open_leader(contract, step=options.step, measure=measure))
+            explained = getattr(leader, "help", "")
+            if explained:
+                say(explained)
         stated = contract is not None and contract.action.relative is not None
-        if options.safe == "auto" and not options.robot and topics is None and not stated:
+        if options.safe == "auto" and not options.robot and not stated:
             options.safe = "hold"  # the simulated robot uses such actions as absolute targets
         settings = PlayerSettings(
             options.mode, options.execute, merge=options.merge, horizon=options.horizon, safe=options.safe,
@@ -173,7 +179,7 @@ def _run(options: argparse.Namespace) -> LoopReport:
         player = stack.enter_context(ChunkPlayer(agent, settings, check=guard, override=leader))
         player.initialize()  # refuses unfit settings before anything is timed or moves
         make_robot = make_robot or partial(SimulatedRobot, contract)
-        robot: Robot = topics or stack.enter_context(opened(make_robot))
+        robot = stack.enter_context(opened(make_robot))
         _require_part(options.measure, robot)
         fit = _require_fit(options, agent, robot, guard.limits, say)
         recorder = None
@@ -230,7 +236,7 @@ def _require_fit(
     """Show the first chunk beside the training of the checkpoint and the limits of the arm, and compare them."""
     trained = None if options.trained_on is None else Trained.read(options.trained_on)
     fit = fit_of(agent, robot, limits, trained=trained, accept=options.accept_misfit)
-    is_default = options.robot is None and options.ros is None
+    is_default = options.robot is None
     if fit.trained == Trained() and not is_default:
         text = (
             "the policy states no ranges of its training, so this arm's pose and the first chunk are not compared with "
@@ -247,39 +253,6 @@ def _require_fit(
             logger.info("%s", line)
         fit.require(obs, rows)
     return fit
-
-
-def _leader(
-    options: argparse.Namespace,
-    make: Callable[[], Leader] | None,
-    contract: Contract | None,
-    stack: contextlib.ExitStack,
-) -> Leader | None:
-    """Return the opened device with which an operator moves the robot."""
-    if options.leader is None:
-        return None
-    if make is not None:
-        try:
-            leader = make()
-        except VLAgentsError:
-            raise
-        except Exception as error:
-            raise ConfigError(
-                f"--leader {options.leader}: could not be made: {type(error).__name__}: {error}; want a class that is "
-                f"made without arguments"
-            ) from error
-        return stack.enter_context(leader) if isinstance(leader, contextlib.AbstractContextManager) else leader
-    if options.leader not in _DEVICES:
-        raise ConfigError(
-            f"--leader: got {options.leader!r}, want one of {list(_DEVICES)}, or MODULE:CLASS"
-            f"{did_you_mean(options.leader, _DEVICES)}"
-        )
-    device = _DEVICES[options.leader]()
-    stack.enter_context(device)
-    if isinstance(device, Keyboard):
-        of_joints = contract is not None and contract.action.space in (None, "joint") and not contract.action.relative
-        print(JOINTS_HELP if of_joints else HELP, flush=True)  # noqa: T201
-    return AxesLeader(contract, device, step=options.step, measure=measured_state(options.measure))
 
 
 def _say_table(report: LoopReport, name: str, say: Callable[[str], None]) -> None:
@@ -362,22 +335,41 @@ def _restarting(
         return True
 
     with contextlib.ExitStack() as undo:
-        has_terminal = False
-        with contextlib.suppress(ConfigError):  # there is no terminal
-            terminal = Terminal()
-            undo.enter_context(terminal.keys_at_once())
-            undo.enter_context(terminal.read_in_background(typed))
-            has_terminal = True
+        has_terminal = undo.enter_context(typed_keys(typed))
         if threading.current_thread() is threading.main_thread() and hasattr(signal, "SIGUSR1"):
             before = signal.signal(signal.SIGUSR1, lambda *_: restarted() and None)
             undo.callback(signal.signal, signal.SIGUSR1, before)
         yield has_terminal
 
 
+def _names_of_plugins() -> str:
+    """Return the subcommands, robots and devices of plug-ins as lines, also of those that are not installed."""
+    lines: list[str] = []
+    for title, kind, prefix in (
+        ("subcommands", "commands", "robot."),
+        ("robots by name", "robots", ""),
+        ("leaders by name", "leaders", ""),
+    ):
+        lines.append(f"{title}:")
+        for name, entry in entries(kind).items():
+            if name.startswith(prefix):
+                shown = name.removeprefix(prefix) + (entry.tasks if kind == "robots" else "")
+                lines.append(f"  {shown:<21} {entry.about}")
+        for name, distribution in not_installed(kind).items():
+            if name.startswith(prefix):
+                cure = pip_install(distribution=distribution)
+                lines.append(f"  {name.removeprefix(prefix):<21} not installed: {cure}")
+        lines.append("")
+    return "\n".join(lines).replace("%", "%%")
+
+
 def command_parser() -> tuple[argparse.ArgumentParser, list[argparse.Action], list[argparse.Action]]:
     """Return the parser, the options that are refused with --env, and those that need it."""
     parser = argparse.ArgumentParser(
-        prog="vlagents-ray robot", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+        prog="vlagents-ray robot",
+        description=__doc__,
+        epilog=_names_of_plugins(),
+        formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     parser.usage = "vlagents-ray robot [http://HOST:PORT] [OPTION ...]"  # else each error lists all options
     groups = parser.add_argument_group("a robot"), parser.add_argument_group("a simulation")
@@ -397,10 +389,9 @@ def command_parser() -> tuple[argparse.ArgumentParser, list[argparse.Action], li
     add("--hz", type=number(above=True, most=_MOST_HZ), help=f"control rate (default: {_HZ:g}, or the environment's)")
     real("--seconds", type=seconds, default=60.0, help="how long (%(default)s)")
     real("--instruction", help="the task in words")
-    real("--robot", metavar="MODULE:CLASS", help="your class, lerobot:TYPE or mujoco:ARM; default: a simulated one")
+    real("--robot", metavar="ROBOT", help="a name as below, or your MODULE:CLASS; default: a simulated one")
     real("--robot-set", metavar="KEY=VALUE", action="append", default=[], help="an argument of the robot, repeatable")
-    real("--ros", metavar="FILE", help="a robot behind topics of ROS 2, from this file; see docs/ros.md")
-    add("--leader", metavar="LEADER", help="device for taking over: keyboard, spacemouse, or your MODULE:CLASS")
+    add("--leader", metavar="LEADER", help="device for taking over: a name as below, or your MODULE:CLASS")
     add("--step", type=seconds, help="what a key or axis of these adds to a number of the action at a tick")
     add(
         "--mode",

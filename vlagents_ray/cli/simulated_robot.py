@@ -20,13 +20,15 @@ from vlagents_ray.errors import ConfigError
 from vlagents_ray.interface import Agent
 from vlagents_ray.policies.wrapper import Wrapper, build_agent
 from vlagents_ray.robot import Guard, run_loop
+from vlagents_ray.robot.leaders import TeleoperatedAgent, leader_named
 from vlagents_ray.robot.record import Recorder
 from vlagents_ray.robot.simulated import EnvRobot
-from vlagents_ray.robot.teleoperation import HELP, AxesLeader, Keyboard, SpaceMouse, TeleoperatedAgent
+from vlagents_ray.robot.terminal import typed_keys
 from vlagents_ray.viewers import EpisodeViewer, open_viewer
 
 KEYS = "p pauses and continues; y success, n failure, x discard end the episode; q quits"
 _HZ = 10.0  # of environments that state no rate
+_LABELS: dict[str, Label] = {"y": "success", "n": "failure", "x": "discard"}
 _MOVES = {
     "autonomous": "the policy moves the robot",
     "human": "you move the robot",
@@ -102,8 +104,6 @@ class RobotRun:
             if self.options.record is not None:
                 opened = Recorder(self.options.record, hz, interventions=leader is not None)
                 self.recorder = stack.enter_context(opened)
-            if self.options.leader == "keyboard":
-                out.print(f"{HELP}\n{KEYS}")
             if self.options.rerun is not None:
                 self._viewer = stack.enter_context(open_viewer(self.options.rerun))
             for seed in seeds:
@@ -148,16 +148,27 @@ class RobotRun:
     def _leader(self, contract: Contract, stack: contextlib.ExitStack) -> Leader | None:
         if self.options.leader is None:
             return None
-        device: Keyboard | SpaceMouse
-        if self.options.leader == "keyboard":
-            verdicts = {"y": "success", "n": "failure", "x": "discard"}
-            keys = {key: lambda label=label: setattr(self, "verdict", label) for key, label in verdicts.items()}
-            device = stack.enter_context(Keyboard({**keys, "p": self._pause, "q": self._quit}))
-        elif self.options.leader == "spacemouse":
-            device = stack.enter_context(SpaceMouse())
+        has_terminal = stack.enter_context(typed_keys(self._press))
+        open_leader = leader_named("--leader", self.options.leader)
+        leader = stack.enter_context(open_leader(contract, step=self.options.step, measure=None))
+        explained = getattr(leader, "help", "")
+        if explained:
+            out.print(explained)
+        if has_terminal:
+            out.print(KEYS)
+        return leader
+
+    def _press(self, key: str) -> bool:
+        """Do what a key of the terminal means; return whether it has a meaning."""
+        if key in _LABELS:
+            self.verdict = _LABELS[key]
+        elif key == "p":
+            self._pause()
+        elif key == "q":
+            self._quit()
         else:
-            raise ConfigError(f"--leader: got {self.options.leader!r}, want one of ['keyboard', 'spacemouse']")
-        return AxesLeader(contract, device, step=self.options.step)
+            return False
+        return True
 
     def _agent(self, contract: Contract, leader: Leader | None, guard: Guard) -> Agent:
         if self.options.policy is None:

@@ -25,6 +25,7 @@ from vlagents_ray.contract import Contract, require_match
 from vlagents_ray.errors import ConfigError, InvalidAction, VLAgentsError
 from vlagents_ray.interface import CAPTURED, CAUSE, INTERVENTION, PLANNED, SAFE, SILENT, WANTED, Act, Agent, Obs
 from vlagents_ray.naming import did_you_mean
+from vlagents_ray.registry import names, not_installed, registered_class
 from vlagents_ray.robot.fit import Fit, Trained
 from vlagents_ray.robot.limits import Limits
 from vlagents_ray.robot.pacing import KEPT_TICKS, Pacer, jitter, undisturbed
@@ -38,10 +39,6 @@ logger = logging.getLogger(__name__)
 
 _COLLECT_S = 2.0
 ROBOT = ("observe", "apply", "stop")  # the methods of a `Robot`
-_ADAPTERS = {
-    "mujoco": "vlagents_ray.robot.mujoco_arm:MujocoArm",
-    "lerobot": "vlagents_ray.robot.lerobot_robot:LeRobotRobot",
-}
 
 
 class Robot(Protocol):
@@ -52,12 +49,12 @@ class Robot(Protocol):
     hangs. While it is not None the robot is stopped; then the loop continues with a new observation. A class around
     another robot derives from `vlagents_ray.robot.wrapper.RobotWrapper`, which keeps these attributes.
 
-    `vlagents-ray robot`, its `check` and `vlagents_ray.robot.check.examine` use further attributes of a robot that has
-    them: `contract`, what it gives and takes; `joint_names`, its joints in the order of an action, without grippers;
-    `joint_limits`, (D, 2) in their units; `dates_pictures`, whether `captured_at` is from the time stamps of its
-    sensors, so that a camera that hangs is found by them; of a simulated one `operator`, a
-    `vlagents_ray.robot.check.Operator` in place of the person at the robot, and `clock`, the module `time` of its
-    simulation; and `close`, called at the end.
+    `vlagents-ray robot` and the check of a robot use further attributes of a robot that has them: `contract`, what it
+    gives and takes; `joint_names`, its joints in the order of an action, without grippers; `joint_limits`, (D, 2) in
+    their units; `dates_pictures`, whether `captured_at` is from the time stamps of its sensors, so that a camera that
+    hangs is found by them; of a simulated one `operator`, which answers the check in place of the person at the robot,
+    and `clock`, the module `time` of its simulation; and `close`, called at the end. A robot that is a context manager
+    is entered before its first use and left at the end, in place of `close`.
     """
 
     def observe(self) -> Obs:
@@ -141,13 +138,19 @@ def import_class(option: str, name: str, methods: Sequence[str] = ()) -> Any:
         public = [known for known in vars(imported) if not known.startswith("_")]
         guess = did_you_mean(attribute, public) or "; write the name of a class in it"
         raise ConfigError(f"{option} {name}: module {module!r} has no {attribute!r}{guess}")
-    if missing := [method for method in methods if not callable(getattr(found, method, None))]:
-        raise ConfigError(f"{option} {name}: lacks {', '.join(missing)}; want a class with {', '.join(methods)}")
-    return found
+    return _with_methods(f"{option} {name}", found, methods)
+
+
+def _with_methods(where: str, cls: Any, methods: Sequence[str]) -> Any:
+    """Return the class; raises `ConfigError` if it lacks one of the methods."""
+    missing = [method for method in methods if not callable(getattr(cls, method, None))]
+    if missing:
+        raise ConfigError(f"{where}: lacks {', '.join(missing)}; want a class with {', '.join(methods)}")
+    return cls
 
 
 def robot_named(option: str, name: str, settings: Iterable[str] = ()) -> Callable[..., Robot]:
-    """Return what makes a robot: "module:Class", or an adapter and its argument, such as "lerobot:so101_follower".
+    """Return what makes a robot: "module:Class", or a registered name and its argument, "mujoco:so101".
 
     The `settings` are further arguments as KEY=VALUE, of which the value is JSON or else text. Raises `ConfigError`.
     """
@@ -160,16 +163,23 @@ def robot_named(option: str, name: str, settings: Iterable[str] = ()) -> Callabl
             given[key] = json.loads(value)
         except json.JSONDecodeError:
             given[key] = value
-    adapter, _, first = name.partition(":")
-    first_argument = (first,) if adapter in _ADAPTERS else ()
-    make = partial(import_class(option, _ADAPTERS.get(adapter, name), ROBOT), *first_argument)
+    registered, _, argument = name.partition(":")
+    make: Callable[..., Robot]
+    if registered in names("robots") or registered in not_installed("robots"):
+        make = partial(_with_methods(f"{option} {name}", registered_class("robots", registered), ROBOT), argument)
+    else:
+        make = import_class(option, name, ROBOT)
     require_arguments(f"{option} {name}", make, given)
     return partial(make, **given)
 
 
 @contextlib.contextmanager
 def opened(make: Callable[[], Robot]) -> Iterator[Robot]:
-    """Yield a new robot, which is closed at the end if it has `close`; raises `ConfigError` if it cannot be made."""
+    """Yield a new robot, which is closed at the end: it is a context manager, or has `close`, or needs neither.
+
+    Raises:
+        ConfigError: It cannot be made.
+    """
     try:
         robot = make()
     except VLAgentsError:
@@ -180,10 +190,12 @@ def opened(make: Callable[[], Robot]) -> Iterator[Robot]:
             f"robot: could not be made: {type(error).__name__}: {error}; check its arguments (--robot-set), its cables "
             f"and its power, or correct its class"
         ) from error
-    try:
+    with contextlib.ExitStack() as stack:
+        if isinstance(robot, contextlib.AbstractContextManager):
+            stack.enter_context(robot)
+        else:
+            stack.callback(getattr(robot, "close", lambda: None))
         yield robot
-    finally:
-        getattr(robot, "close", lambda: None)()
 
 
 @dataclass(slots=True)

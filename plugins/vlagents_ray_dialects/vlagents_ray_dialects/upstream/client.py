@@ -10,7 +10,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from vlagents_ray.errors import ConnectionLost, MalformedMessage, PolicyFailed, PolicyUnavailable
+from vlagents_ray.errors import ConnectionLost, MalformedMessage, PolicyFailed, PolicyUnavailable, shown
 from vlagents_ray.protocol.messages import DEFAULT_LIMITS, Limits
 from vlagents_ray.wire.mapping import matches
 from vlagents_ray_dialects.messages.outgoing import Outgoing
@@ -108,7 +108,7 @@ class UpstreamClient(abc.ABC):
 
     def failed(self, text: object, got: str = "an error") -> PolicyFailed:
         """Log an error that the upstream sent, and return ours, without the upstream's details."""
-        logger.error("upstream %s answered with %s: %s", self.options.url, got, str(text)[:_LOGGED])
+        logger.error("upstream %s answered with %s: %s", self.options.url, got, shown(text, _LOGGED))
         return PolicyFailed(f"upstream {self.options.url}: it answered with {got}, whose text the server's log has")
 
     def closed(self) -> ConnectionLost:

@@ -16,7 +16,7 @@ from websockets.exceptions import ConnectionClosed, InvalidHandshake, InvalidSta
 from websockets.protocol import State
 from websockets.sync.client import ClientConnection, connect
 
-from vlagents_ray.errors import PolicyUnavailable, Unauthorized, VLAgentsError
+from vlagents_ray.errors import PolicyUnavailable, Unauthorized, VLAgentsError, shown
 from vlagents_ray_dialects.messages import openpi, vla_eval
 from vlagents_ray_dialects.messages.outgoing import Outgoing
 from vlagents_ray_dialects.upstream.client import Answer, ClientOptions, UpstreamClient
@@ -231,7 +231,7 @@ class VlaEvalClient(WebSocketClient):
         if (theirs := hello.get("protocol_version")) != vla_eval.PROTOCOL_VERSION:
             self.close()
             raise PolicyUnavailable(
-                f"upstream {self.options.url}: got protocol version {str(theirs)[:20]}, "
+                f"upstream {self.options.url}: got protocol version {shown(theirs, 20)}, "
                 f"want {vla_eval.PROTOCOL_VERSION}"
             )
         return {name: hello[name] for name in _STATED if name in hello}

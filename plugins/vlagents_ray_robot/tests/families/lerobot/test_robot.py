@@ -7,10 +7,10 @@ from lerobot.robots.so_follower import so_follower
 from lerobot_robot_mirror import MOTORS
 
 from vlagents_ray.errors import ConfigError, InvalidAction
-from vlagents_ray.robot import lerobot_robot
-from vlagents_ray.robot.check import examine
 from vlagents_ray.robot.loop import robot_named
-from vlagents_ray.robot.mujoco_arm import SimulatedClock
+from vlagents_ray_robot import lerobot_robot
+from vlagents_ray_robot.check import examine
+from vlagents_ray_robot.mujoco_arm import SimulatedClock
 
 SPEED = 90.0  # deg/s of the motors
 CLOCK = SimulatedClock()

@@ -13,10 +13,10 @@ import numpy as np
 import pytest
 
 from vlagents_ray import Act, ActionSpec, Agent, Contract, Obs
-from vlagents_ray.cli.robot_check import main
 from vlagents_ray.contract import StateSpec
 from vlagents_ray.robot import run_loop
-from vlagents_ray.robot.check import CHECKS, examine
+from vlagents_ray_robot.check import CHECKS, examine
+from vlagents_ray_robot.check_command import main
 
 
 class Own:

@@ -10,11 +10,12 @@ import pytest
 from arm_models import ARMS, model_file, simulated_arm
 from faulty_arms import FAULTS, ClockStep, Fault, FaultyArm, QuaternionOrder
 
-from vlagents_ray.cli.robot_check import main
 from vlagents_ray.errors import ConfigError
-from vlagents_ray.robot.check import CHECKS, Operator, RobotReport, examine
-from vlagents_ray.robot.mujoco_arm import MujocoArm, SimulatedOperator
-from vlagents_ray.testing import ContractViolation, check_robot
+from vlagents_ray.testing import ContractViolation
+from vlagents_ray_robot.check import CHECKS, Operator, RobotReport, examine
+from vlagents_ray_robot.check_command import main
+from vlagents_ray_robot.mujoco_arm import MujocoArm, SimulatedOperator
+from vlagents_ray_robot.testing import check_robot
 
 pytestmark = pytest.mark.sim
 HARM = 0.35  # rad, about 20°: no joint may have been farther from its rest pose

@@ -3,10 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import os
-import select
-import sys
-import threading
 import time
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Mapping
@@ -17,10 +13,12 @@ import numpy as np
 from vlagents_ray.chunking.control import Leader
 from vlagents_ray.contract import Contract
 from vlagents_ray.errors import ConfigError, MissingState
-from vlagents_ray.interface import INTERVENTION, Act, Agent, Obs
+from vlagents_ray.interface import Obs
 from vlagents_ray.registry import require
+from vlagents_ray.robot.terminal import Terminal
+from vlagents_ray_robot import DISTRIBUTION
 
-__all__ = ["AxesDevice", "AxesLeader", "Keyboard", "Leader", "SpaceMouse", "TeleoperatedAgent"]
+__all__ = ["AxesDevice", "AxesLeader", "Keyboard", "SpaceMouse", "open_keyboard", "open_spacemouse"]
 
 _FULLY_OPEN = 0.9  # below this opening, a gripper may hold something
 
@@ -43,6 +41,10 @@ class AxesDevice(ABC):
         """Return the number of presses of the gripper's button since the last call."""
         presses, self._presses = self._presses, 0
         return presses
+
+    def help(self, *, joints: bool) -> str:
+        """Return a line that explains the device to the operator; `joints`: whether its axes are joints."""
+        return ""
 
 
 class AxesLeader:
@@ -104,6 +106,11 @@ class AxesLeader:
         self._engaged = False
         self._closed: bool | None = None  # None: as at the takeover
         self._target: np.ndarray | None = None  # of absolute actions
+
+    @property
+    def help(self) -> str:
+        """A line that explains the device to the operator; "" if it needs none."""
+        return self._device.help(joints=self._spec.space in (None, "joint") and not self._spec.relative)
 
     def engaged(self) -> bool:
         """Read the device, and return whether the operator moves the robot."""
@@ -202,6 +209,9 @@ class Keyboard(AxesDevice):
         pressed = self._until > time.monotonic()
         return pressed[:, 0].astype(np.float32) - pressed[:, 1]
 
+    def help(self, *, joints: bool) -> str:
+        return JOINTS_HELP if joints else HELP
+
     def _press(self, key: str) -> bool:
         if key in AXES:
             axis, sign = AXES[key]
@@ -239,7 +249,7 @@ class SpaceMouse(AxesDevice):
 
     def __init__(self) -> None:
         try:
-            library: Any = require("pyspacemouse")
+            library: Any = require("pyspacemouse", extra="spacemouse", distribution=DISTRIBUTION)
             self._device: Any = library.open(axis_convention=library.AxisConvention.ROS)
         except (OSError, RuntimeError) as error:  # also of hidapi, which the library loads
             raise ConfigError(
@@ -278,126 +288,22 @@ class SpaceMouse(AxesDevice):
         return self._axes
 
 
-# An operator as an agent, for demonstrations in the same loop as a policy.
+# The devices by name, `--leader keyboard`; see `vlagents_ray.robot.leaders.OpenLeader`.
 
 
-class TeleoperatedAgent(Agent):
-    """An agent whose actions are all a leader's, engaged or not; there is no policy.
-
-    Args:
-        leader: The device with which the operator moves the robot.
-        contract: The contract of the robot, for the loop's guard.
-    """
-
-    contract: Contract | None = None
-
-    def __init__(self, leader: Leader, contract: Contract | None = None) -> None:
-        self._leader = leader
-        self.contract = contract
-
-    def act(self, obs: Obs) -> Act:
-        """Return the operator's action, (D,) float32, with `info["intervention"]`."""
-        self._leader.engaged()  # reads the device
-        return Act(self._leader.action(obs), info={INTERVENTION: True})
-
-    def interrupt(self) -> None:
-        """Let absolute targets begin at the measured pose again, as the robot was stopped."""
-        rebase = getattr(self._leader, "rebase", None)
-        if rebase is not None:
-            rebase(None)
+@contextlib.contextmanager
+def open_keyboard(
+    contract: Contract | None, *, step: float | None = None, measure: Callable[[Obs], np.ndarray] | None = None
+) -> Iterator[Leader]:
+    """Yield the keys of the terminal as a leader; arguments as of `AxesLeader`."""
+    with Keyboard() as device:
+        yield AxesLeader(contract, device, step=step, measure=measure)
 
 
-# The only reader of the terminal, so that each typed key has exactly one consumer.
-
-Consumer = Callable[[str], bool]  # gets a key in lower case; returns whether it has a meaning for that key
-
-
-class Terminal:
-    """A terminal whose keys go to the newest consumer, such as a keyboard that moves the robot.
-
-    A key without meaning for it goes to the consumer before, and last to one that reads in the background. Two objects
-    of one terminal share its consumers. The default `descriptor` is that of standard input; raises `ConfigError` if it
-    is no terminal.
-    """
-
-    _consumers: dict[tuple[int, int], list[Consumer]] = {}  # noqa: RUF012 - of all terminals of this process
-    _lock = threading.RLock()
-
-    def __init__(self, descriptor: int | None = None) -> None:
-        if descriptor is None and sys.stdin is not None:
-            with contextlib.suppress(OSError, ValueError):  # a replacement of standard input need not be a file
-                descriptor = sys.stdin.fileno()
-        if descriptor is None or not os.isatty(descriptor):
-            raise ConfigError("terminal: got no terminal, want one to read keys from; run this in one")
-        self.descriptor = descriptor
-        about = os.fstat(descriptor)
-        self._own = self._consumers.setdefault((about.st_dev, about.st_ino), [])
-
-    @contextlib.contextmanager
-    def keys_at_once(self) -> Iterator[None]:
-        """Deliver each key at once, without echo, within the context; Ctrl-C still works."""
-        import termios
-        import tty
-
-        if not self._is_in_foreground():  # else changing the terminal would suspend the process
-            yield
-            return
-        before = termios.tcgetattr(self.descriptor)
-        tty.setcbreak(self.descriptor)
-        try:
-            yield
-        finally:
-            termios.tcsetattr(self.descriptor, termios.TCSADRAIN, before)
-
-    @contextlib.contextmanager
-    def consumed_by(self, consumer: Consumer, *, last: bool = False) -> Iterator[None]:
-        """Pass the keys to a consumer within the context, as the newest or, with `last`, after all others."""
-        with self._lock:
-            self._own.insert(0 if last else len(self._own), consumer)
-        try:
-            yield
-        finally:
-            with self._lock:
-                self._own.remove(consumer)
-
-    def read(self, consumer: Consumer) -> bool:
-        """Pass typed keys to their consumers, if this one is the newest; return whether the terminal is open."""
-        with self._lock:
-            if consumer not in self._own:
-                raise ConfigError("terminal: this consumer has not begun; want `with` around its use")
-            if self._own[-1] != consumer:
-                return True
-            while self._is_in_foreground() and select.select([self.descriptor], [], [], 0)[0]:
-                typed = b""
-                with contextlib.suppress(OSError):
-                    typed = os.read(self.descriptor, 1024)
-                if not typed:
-                    return False
-                for key in typed.decode(errors="replace").lower().replace("\r", "\n"):
-                    any(one(key) for one in reversed(self._own))
-            return True
-
-    @contextlib.contextmanager
-    def read_in_background(self, consumer: Consumer) -> Iterator[None]:
-        """Pass keys without another consumer to this one, from a thread, within the context."""
-        over = threading.Event()
-
-        def read() -> None:
-            while self.read(consumer) and not over.wait(0.1):
-                pass
-
-        thread = threading.Thread(target=read, name="vlagents-ray-terminal", daemon=True)
-        with self.consumed_by(consumer, last=True):
-            thread.start()
-            try:
-                yield
-            finally:
-                over.set()
-                thread.join()
-
-    def _is_in_foreground(self) -> bool:
-        """Return whether this process may read: in the background, reading from the terminal would suspend it."""
-        try:
-            return os.tcgetpgrp(self.descriptor) == os.getpgrp()
-        except OSError:  # not this process's controlling terminal, so reading suspends nothing
-            return True
+@contextlib.contextmanager
+def open_spacemouse(
+    contract: Contract | None, *, step: float | None = None, measure: Callable[[Obs], np.ndarray] | None = None
+) -> Iterator[Leader]:
+    """Yield a SpaceMouse as a leader; arguments as of `AxesLeader`."""
+    with SpaceMouse() as device:
+        yield AxesLeader(contract, device, step=step, measure=measure)

@@ -18,12 +18,13 @@ from vlagents_ray.chunking.buffer import SKEW_S, CaptureClock
 from vlagents_ray.contract import ActionSpec, CameraSpec, Contract, StateSpec
 from vlagents_ray.errors import ConfigError, InvalidAction, VLAgentsError
 from vlagents_ray.interface import CAPTURED, Obs
-from vlagents_ray.robot.ros import messages
-from vlagents_ray.robot.ros.links import Link, Ros2, Rosbridge
-from vlagents_ray.robot.ros.messages import TWIST, PoseRotation, Values
 from vlagents_ray.robot.safety import Watchdog
 from vlagents_ray.settings import require_arguments
 from vlagents_ray.yaml_text import load_yaml
+from vlagents_ray_robot import DISTRIBUTION
+from vlagents_ray_robot.ros import messages
+from vlagents_ray_robot.ros.links import Link, Ros2, Rosbridge
+from vlagents_ray_robot.ros.messages import TWIST, PoseRotation, Values
 
 logger = logging.getLogger(__name__)
 ROS2 = "ros2"
@@ -131,7 +132,7 @@ def read_settings(file: Path | str) -> RosSettings:
         MissingDependency: PyYAML is not installed.
     """
     try:
-        stated = load_yaml(Path(file).read_text(encoding="utf-8"), extra="ros")
+        stated = load_yaml(Path(file).read_text(encoding="utf-8"), extra="ros", distribution=DISTRIBUTION)
     except (OSError, ValueError) as error:
         raise ConfigError(f"{file}: cannot be read as a file of ROS topics ({error})") from error
     return settings_from(stated, str(file))
@@ -319,14 +320,16 @@ class RosRobot:
     manager, which connects and waits for the first message of each topic.
 
     Args:
-        settings: The topics.
+        settings: The topics, or the path of their YAML file.
         link: The link to them; by default that of the settings.
     """
 
     dates_pictures = True
     """Whether `captured_at` is from the messages, so that a camera that hangs is found by the age of its picture."""
 
-    def __init__(self, settings: RosSettings, link: Link | None = None) -> None:
+    def __init__(self, settings: RosSettings | Path | str, link: Link | None = None) -> None:
+        if not isinstance(settings, RosSettings):
+            settings = read_settings(settings)
         self.settings = settings
         self.holds: str | None = None
         self.watchdog: Watchdog | None = None

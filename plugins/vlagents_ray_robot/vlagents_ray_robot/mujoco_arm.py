@@ -18,7 +18,8 @@ from vlagents_ray.errors import ConfigError, InvalidAction
 from vlagents_ray.interface import CAPTURED, Obs
 from vlagents_ray.naming import did_you_mean
 from vlagents_ray.registry import require
-from vlagents_ray.robot.check import Operator, arm_part
+from vlagents_ray_robot import DISTRIBUTION
+from vlagents_ray_robot.check import Operator, arm_part
 
 if not os.environ.get("DISPLAY"):  # here, as packages of models import mujoco, which then reads it
     os.environ.setdefault("MUJOCO_GL", "egl")
@@ -120,7 +121,7 @@ class MujocoArm:
         speed: float = 1.5,
         clock: Any = time,
     ) -> None:
-        self._mujoco = mujoco = require("mujoco", extra="arms")
+        self._mujoco = mujoco = require("mujoco", extra="arms", distribution=DISTRIBUTION)
         stated = ARMS.get(like or str(model), ArmModel(str(model)))
         self.clock, self.delta, self.speed = clock, delta, speed
         self.arms = stated.arms or ("",)
@@ -364,7 +365,7 @@ def _read(mujoco: Any, stated: ArmModel, model: str) -> Any:
     """Return the specification of a model file, which MuJoCo can compile."""
     file = Path(model)
     if file.suffix not in (".xml", ".mjcf", ".urdf"):
-        menagerie = require("mujoco_menagerie", extra="arms")
+        menagerie = require("mujoco_menagerie", extra="arms", distribution=DISTRIBUTION)
         known = menagerie.names()
         if stated.menagerie not in known:
             raise ConfigError(

@@ -12,8 +12,8 @@ import yaml
 
 import vlagents_ray.cli.robot as robot_command
 from vlagents_ray.errors import ConfigError
-from vlagents_ray.robot.ros import read_settings
-from vlagents_ray.robot.ros.robot import settings_from
+from vlagents_ray_robot.ros import read_settings
+from vlagents_ray_robot.ros.robot import settings_from
 
 EXAMPLES = Path(__file__).parents[3] / "examples/ros"
 ARM: dict[str, Any] = {

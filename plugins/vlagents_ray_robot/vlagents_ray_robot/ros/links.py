@@ -20,11 +20,15 @@ from typing import Any
 from websockets.exceptions import ConnectionClosed, WebSocketException
 from websockets.sync.client import ClientConnection, connect
 
-from vlagents_ray.errors import ConfigError, ConnectionLost, MalformedMessage, VLAgentsError, shown
+from vlagents_ray.errors import ConfigError, ConnectionLost, MalformedMessage, MissingDependency, VLAgentsError, shown
 from vlagents_ray.registry import require
 
 logger = logging.getLogger(__name__)
 _SILENT_S = 2.0
+_GET_ROS = (
+    "source the setup file of ROS 2 (`. /opt/ros/jazzy/setup.bash`) and start its Python, or reach ROS through a "
+    "rosbridge, `link: ws://arm-pc:9090`"
+)
 # The kernel's time limit for a send, which websockets lacks: a dead link would block the control loop for minutes.
 _SEND_LIMIT = struct.pack("@ll", 0, 200_000)
 _LARGEST = 64 << 20  # bytes of a frame; a 4K image in base64 has 34 million
@@ -38,7 +42,10 @@ class Ros2:
     connections = 1
 
     def __init__(self, node: str = "vlagents_ray") -> None:
-        rclpy: Any = require("rclpy")
+        try:
+            rclpy: Any = require("rclpy")
+        except MissingDependency as error:
+            raise MissingDependency(f"'rclpy' is not installed; {_GET_ROS}") from error
         self._context: Any = rclpy.context.Context()
         self._context.init()
         self._node: Any = rclpy.create_node(node, context=self._context)

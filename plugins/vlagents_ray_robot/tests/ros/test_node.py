@@ -25,11 +25,11 @@ from vlagents_ray import Act, ActionSpec, Agent, CameraSpec, ChunkPlayer, Contra
 from vlagents_ray.contract import require_match
 from vlagents_ray.errors import ConfigError, ContractMismatch, InvalidAction
 from vlagents_ray.robot import Guard, Watchdog, run_loop
-from vlagents_ray.robot.check import examine
 from vlagents_ray.robot.loop import LoopReport
-from vlagents_ray.robot.ros import RosRobot
-from vlagents_ray.robot.ros.robot import settings_from
 from vlagents_ray.robot.safety import measured_state
+from vlagents_ray_robot.check import examine
+from vlagents_ray_robot.ros import RosRobot
+from vlagents_ray_robot.ros.robot import settings_from
 
 STEP = 0.01
 MAX_STEP = 0.05
@@ -140,7 +140,7 @@ def test_the_command_drives_an_arm_from_its_topics_and_stops_it_where_it_is(
     with ahead_server(agent) as port, rosbridge_double() as double:
         (tmp_path / "arm.yaml").write_text(yaml.safe_dump(ros_arm.settings(double.url)))
         with RosArm(double.publish, lambda: double.on(COMMANDS)) as arm:
-            options = f"--ros {tmp_path / 'arm.yaml'} --hz 30 --mode open_loop --restart auto".split()
+            options = f"--robot ros:{tmp_path / 'arm.yaml'} --hz 30 --mode open_loop --restart auto".split()
             said = ["--instruction", "stack the cups", "--measure", "joints", "--max-step", str(MAX_STEP)]
             status = command.main([f"http://127.0.0.1:{port}", *options, *said])
     assert status != 2, capsys.readouterr().out  # a busy machine may be late at a tick
@@ -275,7 +275,7 @@ def test_a_killed_server_stops_the_arm(tmp_path: Path, capsys: pytest.CaptureFix
     with server, rosbridge_double() as double:
         (tmp_path / "arm.yaml").write_text(yaml.safe_dump(ros_arm.settings(double.url)))
         with RosArm(double.publish, lambda: double.on(COMMANDS)) as arm:
-            options = f"--ros {tmp_path / 'arm.yaml'} --hz 30 --seconds 4 --silent-s 1".split()
+            options = f"--robot ros:{tmp_path / 'arm.yaml'} --hz 30 --seconds 4 --silent-s 1".split()
             status: list[int] = []
             options += ["--timeout-s", "1", "--restart", "auto"]  # a busy machine may stop it before
             run = [url, *options, "--measure", "joints", "--max-step", str(MAX_STEP)]
@@ -334,7 +334,7 @@ def test_a_policy_for_another_robot_is_refused(tmp_path: Path, capsys: pytest.Ca
         with RosArm(double.publish, lambda: double.on(COMMANDS)):
             cameras = {"cameras": {"top": {"topic": CAMERA}}}
             (tmp_path / "arm.yaml").write_text(yaml.safe_dump(ros_arm.settings(double.url, **cameras)))
-            assert command.main([f"http://127.0.0.1:{port}", "--ros", str(tmp_path / "arm.yaml")]) == 2
+            assert command.main([f"http://127.0.0.1:{port}", "--robot", f"ros:{tmp_path / 'arm.yaml'}"]) == 2
         assert double.on(COMMANDS) == []
     assert "camera 'front': the policy needs it, the env gives ['top']" in capsys.readouterr().err
 
@@ -352,7 +352,7 @@ def test_the_check_of_a_robot_behind_topics_moves_nothing(
         (tmp_path / "arm.yaml").write_text(yaml.safe_dump(settings))
         policy = ["--policy", f"http://127.0.0.1:{port}"] if declared else []
         with RosArm(double.publish, lambda: double.on(COMMANDS)):
-            status = command.main(["check", "--ros", str(tmp_path / "arm.yaml"), "--hz", "20", *policy])
+            status = command.main(["check", f"ros:{tmp_path / 'arm.yaml'}", "--hz", "20", *policy])
         states_meaning = declared or stop == "joints"
         assert status == (0 if states_meaning else 3)
         assert len({tuple(one["data"]) for one in double.on(COMMANDS)}) <= 1, "stops, with the measured pose"

@@ -18,8 +18,8 @@ from eval_fakes import wait_for
 from rosbridge_double import RosbridgeDouble, rosbridge_double
 
 from vlagents_ray.errors import ConnectionLost, MalformedMessage
-from vlagents_ray.robot.ros import messages
-from vlagents_ray.robot.ros.links import Rosbridge, decoded
+from vlagents_ray_robot.ros import messages
+from vlagents_ray_robot.ros.links import Rosbridge, decoded
 
 RECORDED = [json.loads(line) for line in (Path(__file__).parent / "recorded_rosbridge.jsonl").read_text().splitlines()]
 STAMP = 1_700_000_000.25
@@ -101,7 +101,7 @@ def test_a_link_that_is_lost_publishes_nothing_and_comes_back_with_its_topics() 
 @pytest.mark.parametrize("busy", [True, False])
 def test_a_silent_sensor_is_subscribed_to_again(busy: bool, monkeypatch: pytest.MonkeyPatch) -> None:
     """A real server that subscribed before it knew the publisher may have chosen a quality that does not match it."""
-    monkeypatch.setattr("vlagents_ray.robot.ros.links._SILENT_S", 0.2)
+    monkeypatch.setattr("vlagents_ray_robot.ros.links._SILENT_S", 0.2)
     with rosbridge_double() as double, linked(double, lambda _: None, "/silent", "/busy"):
 
         def again() -> bool:

@@ -11,8 +11,8 @@ from arm_models import ARMS, model_file, simulated_arm
 
 from vlagents_ray.errors import ConfigError, InvalidAction
 from vlagents_ray.robot.loop import robot_named
-from vlagents_ray.robot.mujoco_arm import MujocoArm, SimulatedClock
 from vlagents_ray.validation import check_observation
+from vlagents_ray_robot.mujoco_arm import MujocoArm, SimulatedClock
 
 pytestmark = pytest.mark.sim
 MOTOR = """<mujoco><worldbody><body><joint name="a" range="-1 1"/><geom size="0.1"/></body></worldbody>
@@ -83,6 +83,6 @@ def test_a_wrong_model_is_an_error_with_its_cure(tmp_path: Path, monkeypatch: py
 
 
 def test_the_module_chooses_the_renderer_before_a_package_of_models_imports_mujoco() -> None:
-    script = "import os, vlagents_ray.robot.mujoco_arm; print(os.environ['MUJOCO_GL'])"
+    script = "import os, vlagents_ray_robot.mujoco_arm; print(os.environ['MUJOCO_GL'])"
     done = subprocess.run([sys.executable, "-c", script], env={}, capture_output=True, text=True, check=True)
     assert done.stdout == "egl\n"

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from vlagents_ray.interface import CAPTURED, Obs
-from vlagents_ray.robot.mujoco_arm import MujocoArm
+from vlagents_ray_robot.mujoco_arm import MujocoArm
 
 
 class FaultyArm:

@@ -20,8 +20,9 @@ from vlagents_ray.envs import make_env
 from vlagents_ray.errors import MissingDependency, MissingState
 from vlagents_ray.policies.noop import Noop, NoopConfig
 from vlagents_ray.robot import Guard, Limits, run_loop
+from vlagents_ray.robot.leaders import TeleoperatedAgent
 from vlagents_ray.robot.simulated import EnvRobot
-from vlagents_ray.robot.teleoperation import AxesLeader, Keyboard, SpaceMouse, TeleoperatedAgent
+from vlagents_ray_robot.teleoperation import AxesLeader, Keyboard, SpaceMouse
 
 DELTAS = Contract(
     action=ActionSpec(dim=4, delta=True, gripper_open=1.0, gripper_closed=-1.0, low=-1.0, high=1.0), gripper=True
@@ -32,7 +33,7 @@ JOINTS = Contract(action=ActionSpec(dim=3, delta=False, low=-1.0, high=1.0))
 @pytest.fixture
 def clock(monkeypatch: pytest.MonkeyPatch) -> Clock:
     clock = Clock()
-    monkeypatch.setattr("vlagents_ray.robot.teleoperation.time.monotonic", clock)
+    monkeypatch.setattr("vlagents_ray_robot.teleoperation.time.monotonic", clock)
     return clock
 
 

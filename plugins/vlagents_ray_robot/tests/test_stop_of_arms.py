@@ -13,11 +13,9 @@ import pytest
 from arm_models import simulated_arm
 from ros_arm import COMMANDS, JOINTS, Wire, header
 
-from vlagents_ray import ActionSpec, Contract
-from vlagents_ray.robot.lerobot_robot import LeRobotRobot, OneAtATime
-from vlagents_ray.robot.ros import RosRobot
-from vlagents_ray.robot.ros.robot import settings_from
-from vlagents_ray.robot.simulated import SimulatedRobot
+from vlagents_ray_robot.lerobot_robot import LeRobotRobot, OneAtATime
+from vlagents_ray_robot.ros import RosRobot
+from vlagents_ray_robot.ros.robot import settings_from
 
 MOTORS = ("shoulder", "elbow", "gripper")
 POSE = np.array([12.0, -3.0, 31.0], np.float32)  # the fingers stand at an object, 31 % open
@@ -244,24 +242,6 @@ def test_a_robot_behind_topics_without_a_recent_pose_stays_as_it_is() -> None:
         wire.deliver(13.0, -3.0, 31.0)
         robot.observe()  # the stop is sent as soon as the pose is known
         assert last_goal(wire) == pytest.approx([13.0, -3.0, GRASP])
-
-
-@pytest.mark.parametrize("delta", [False, True])
-@pytest.mark.parametrize("arms", [None, ("left", "right")])
-def test_a_simulated_robot_stops_where_it_is_and_keeps_its_grasp(delta: bool, arms: tuple[str, ...] | None) -> None:
-    dim = 3 * len(arms or ("",))
-    spec = ActionSpec(dim=dim, delta=delta, gripper_open=1.0, gripper_closed=0.0, arms=arms)
-    robot = SimulatedRobot(Contract(action=spec))
-    robot.apply(np.full(dim, 1.0, np.float32))
-    robot.observe()
-    for _ in range(3):
-        robot.stop()
-    before = robot.observe().state["joints"]
-    for _ in range(50):
-        after = robot.observe().state["joints"]
-    grippers = spec.gripper_columns(dim)
-    assert np.allclose(np.delete(after, grippers), np.delete(before, grippers))
-    assert np.allclose(after[grippers], 1.0), "as commanded before the stop"
 
 
 @pytest.mark.sim

@@ -21,10 +21,9 @@ from functools import partial
 from vlagents_ray.cli.arguments import number, parse_all
 from vlagents_ray.client.agent import RemoteAgent
 from vlagents_ray.errors import VLAgentsError
-from vlagents_ray.robot.check import Operator, RobotReport, examine
-from vlagents_ray.robot.loop import Robot, opened, robot_named
-from vlagents_ray.robot.mujoco_arm import SimulatedClock
-from vlagents_ray.robot.ros import RosRobot, read_settings
+from vlagents_ray.robot.loop import opened, robot_named
+from vlagents_ray_robot.check import Operator, RobotReport, examine
+from vlagents_ray_robot.mujoco_arm import SimulatedClock
 
 UNDECLARED = 3  # exit status
 
@@ -33,14 +32,12 @@ def main(arguments: Sequence[str]) -> int:
     """Run the command, and return its exit status."""
     parser = command_parser()
     options = parse_all(parser, arguments, {"--report": "the page is written by --out FILE"})
-    if (options.robot is None) == (options.ros is None):
-        parser.error("want a robot, as my_arm:MyArm, lerobot:TYPE or mujoco:ARM, or one behind ROS 2 (--ros FILE)")
     try:
         with contextlib.ExitStack() as stack:
             if options.json:  # standard output is for the document alone, without the questions to the operator
                 stack.enter_context(contextlib.redirect_stdout(sys.stderr))
             report = _checked(options, stack)
-        report.robot = options.robot or options.ros
+        report.robot = options.robot
     except VLAgentsError as error:
         print(f"{type(error).__name__}: {error}", file=sys.stderr)  # noqa: T201
         return 2
@@ -58,14 +55,10 @@ def main(arguments: Sequence[str]) -> int:
 
 
 def _checked(options: argparse.Namespace, stack: contextlib.ExitStack) -> RobotReport:
-    robot: Robot
-    if options.ros is not None:
-        robot = stack.enter_context(RosRobot(read_settings(options.ros)))
-    else:
-        make = robot_named("robot", options.robot, options.robot_set)
-        if options.robot.startswith("mujoco:"):
-            make = partial(make, clock=SimulatedClock())
-        robot = stack.enter_context(opened(make))
+    make = robot_named("robot", options.robot, options.robot_set)
+    if options.robot.startswith("mujoco:"):
+        make = partial(make, clock=SimulatedClock())
+    robot = stack.enter_context(opened(make))
     contract = None
     if options.policy is not None:
         with RemoteAgent(options.policy) as agent:
@@ -80,9 +73,8 @@ def command_parser() -> argparse.ArgumentParser:
         prog="vlagents-ray robot check", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     add = parser.add_argument
-    names = "my_arm:MyArm, lerobot:so101_follower, mujoco:so101, or mujoco:PATH of an MJCF or URDF file"
-    add("robot", nargs="?", help=names)
-    add("--ros", metavar="FILE", help="check a robot behind topics of ROS 2, from this file; see docs/ros.md")
+    names = "my_arm:MyArm, lerobot:so101_follower, mujoco:so101, mujoco:PATH of an MJCF or URDF file, or ros:FILE"
+    add("robot", help=names)
     add("--robot-set", metavar="KEY=VALUE", action="append", default=[], help="an argument of the robot, repeatable")
     add("--move", action="store_true", help="make small moves, each after a question at the terminal")
     add("--policy", metavar="URL", help="check by the contract of the policy of this server, not by the robot's own")

@@ -16,7 +16,7 @@ from many import many
 
 from vlagents_ray.errors import InvalidObservation, MalformedMessage, MessageTooLarge, MissingState, VLAgentsError
 from vlagents_ray.images.jpeg_png import encode_jpeg, encode_png
-from vlagents_ray.robot.ros import messages
+from vlagents_ray_robot.ros import messages
 
 RGB = np.arange(2 * 3 * 3, dtype=np.uint8).reshape(2, 3, 3) * 7
 
