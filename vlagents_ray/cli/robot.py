@@ -363,12 +363,19 @@ def _names_of_plugins() -> str:
     return "\n".join(lines).replace("%", "%%")
 
 
+class _RobotParser(argparse.ArgumentParser):
+    """A parser whose help ends with the names of plug-ins, which are read only then."""
+
+    def format_help(self) -> str:
+        self.epilog = _names_of_plugins()
+        return super().format_help()
+
+
 def command_parser() -> tuple[argparse.ArgumentParser, list[argparse.Action], list[argparse.Action]]:
     """Return the parser, the options that are refused with --env, and those that need it."""
-    parser = argparse.ArgumentParser(
+    parser = _RobotParser(
         prog="vlagents-ray robot",
         description=__doc__,
-        epilog=_names_of_plugins(),
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     parser.usage = "vlagents-ray robot [http://HOST:PORT] [OPTION ...]"  # else each error lists all options

@@ -13,6 +13,8 @@ import pytest
 from arm_models import simulated_arm
 from ros_arm import COMMANDS, JOINTS, Wire, header
 
+from vlagents_ray.registry import entries
+from vlagents_ray_robot import DISTRIBUTION
 from vlagents_ray_robot.lerobot_robot import LeRobotRobot, OneAtATime
 from vlagents_ray_robot.ros import RosRobot
 from vlagents_ray_robot.ros.robot import settings_from
@@ -262,3 +264,8 @@ def test_an_arm_in_mujoco_stops_where_it_is_and_keeps_its_grasp(name: str, delta
         arm.stop()
         assert np.abs(arm.joints() - stopped).max() < 0.2, "far from the goal"
         assert np.allclose(np.array(arm._goal)[grippers], 0.4)
+
+
+def test_each_robot_that_this_distribution_registers_is_stopped_here() -> None:
+    registered = {name for name, entry in entries("robots").items() if entry.distribution == DISTRIBUTION}
+    assert registered == {"lerobot", "mujoco", "ros"}
