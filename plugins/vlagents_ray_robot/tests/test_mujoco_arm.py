@@ -1,5 +1,6 @@
 """Arms in MuJoCo: names, files, units, and a stop."""
 
+import os
 import subprocess
 import sys
 from contextlib import closing
@@ -84,5 +85,6 @@ def test_a_wrong_model_is_an_error_with_its_cure(tmp_path: Path, monkeypatch: py
 
 def test_the_module_chooses_the_renderer_before_a_package_of_models_imports_mujoco() -> None:
     script = "import os, vlagents_ray_robot.mujoco_arm; print(os.environ['MUJOCO_GL'])"
-    done = subprocess.run([sys.executable, "-c", script], env={}, capture_output=True, text=True, check=True)
+    environment = {"PYTHONPATH": os.pathsep.join(sys.path)}  # no display
+    done = subprocess.run([sys.executable, "-c", script], env=environment, capture_output=True, text=True, check=True)
     assert done.stdout == "egl\n"

@@ -15,7 +15,7 @@ from vlagents_ray.errors import ConfigError
 from vlagents_ray_robot.ros import read_settings
 from vlagents_ray_robot.ros.robot import settings_from
 
-EXAMPLES = Path(__file__).parents[3] / "examples/ros"
+EXAMPLES = Path(__file__).parents[4] / "examples/ros"
 ARM: dict[str, Any] = {
     "link": "ws://arm-pc:9090",
     "cameras": {"front": {"topic": "/camera/image_raw"}},
