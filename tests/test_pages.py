@@ -35,7 +35,7 @@ RUN_HERE = [(page, block) for page, block in BLOCKS if page not in TUTORIALS and
 SEEDS = {"first": 0, "a": 0, "b": 10, "machine-a": 20, "machine-b": 30} | {f"array/{n}": 100 * n for n in range(4)}
 
 # What a sentence names can mostly not be typed as it stands ("vlagents-ray serve POLICY"); of the rest, these are run,
-RUN = {"vlagents-ray doctor", "vlagents-ray policies"}
+RUN = {"vlagents-ray doctor", "vlagents-ray policies", "vlagents-ray robot --help"}
 # and these are not.
 NOT_RUN = {
     "vlagents-ray envs": "a block of docs/evaluation/index.md runs it",
