@@ -182,7 +182,7 @@ def test_a_group_begins_in_one_state_and_differs_in_the_seed_of_the_policy() -> 
     assert [one["episode"][0] for one in got] == [0, 0, 0, 1, 1, 1]
     assert len({one["action"].tobytes() for one in got}) == 6
     assert len({one["key"][0] for one in got}) == 6
-    with pytest.raises(ConfigError, match="got 4 episodes, want a multiple of groups, 3"):
+    with pytest.raises(ConfigError, match="expected a multiple of groups, 3, got 4 episodes"):
         found.collect(4)
 
 
@@ -341,9 +341,9 @@ def test_envs_of_different_columns_do_not_fit_into_one_table(monkeypatch: pytest
 @pytest.mark.parametrize(
     ("settings", "message"),
     [
-        ({"groups": 0}, "groups: got 0, want at least 1"),
-        ({"want": ["logits"]}, r"want: got \['logits'\], want some of"),
-        ({"first": -1}, "first: got -1"),
+        ({"groups": 0}, "groups: expected at least 1, got 0"),
+        ({"want": ["logits"]}, r"want: expected some of .*, got \['logits'\]"),
+        ({"first": -1}, "first: expected at least 0, got -1"),
     ],
 )
 def test_wrong_settings_are_errors_before_any_worker_starts(settings: dict[str, Any], message: str) -> None:

@@ -207,16 +207,16 @@ def test_weights_that_nobody_names_are_refused(plan: EvalConfig) -> None:
 def test_an_agent_that_is_not_initialized_and_a_model_without_one_are_refused(plan: EvalConfig) -> None:
     with pytest.raises(NotTrainable, match=r"trainable: 'Proportional' object has no .*; call initialize\(\) first"):
         TrainingEvaluation(Proportional(), plan).play(1)
-    with pytest.raises(ConfigError, match="policy: got dict, want an Agent, or the URL of its server"):
+    with pytest.raises(ConfigError, match="policy: expected an Agent, or the URL of its server, got dict"):
         TrainingEvaluation({}, plan)  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize(
     ("changes", "share", "error"),
     [
-        ({}, 0.0, "share: got 0.0, want a part"),
-        ({}, 1.5, "share: got 1.5, want a part"),
-        ({"steps": [1, 2]}, 0.1, "want one without steps"),
+        ({}, 0.0, "share: expected a part .* got 0.0"),
+        ({}, 1.5, "share: expected a part .* got 1.5"),
+        ({"steps": [1, 2]}, 0.1, "expected one policy without steps"),
         ({"envs": ["nowhere"]}, 0.1, "nowhere"),
     ],
 )

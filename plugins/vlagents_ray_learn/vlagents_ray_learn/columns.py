@@ -104,10 +104,11 @@ def log_ratio(learner: Any, server: Any) -> LogRatio:
     Raises:
         InvalidInput: The shapes differ, or no row is left.
     """
-    own, stated = (to_numpy(values).astype(np.float64) for values in (learner, server))
-    if own.shape != stated.shape or not own.ndim:
-        raise InvalidInput(f"log_ratio: got shapes {own.shape} and {stated.shape}, want one shape (B, ...) of both")
-    ratios = (own - stated).reshape(len(own), -1).sum(1)
+    learned = to_numpy(learner).astype(np.float64)
+    served = to_numpy(server).astype(np.float64)
+    if learned.shape != served.shape or not learned.ndim:
+        raise InvalidInput(f"log_ratio: expected one shape (B, ...) of both, got {learned.shape} and {served.shape}")
+    ratios = (learned - served).reshape(len(learned), -1).sum(1)
     ratios = ratios[~np.isnan(ratios)]
     if not ratios.size:
         raise InvalidInput('log_ratio: got no act with log-probabilities; request them with want=["logprob"]')

@@ -254,20 +254,25 @@ class ServerTarget:
 
     def push(self, named: Mapping[str, Any], options: PushOptions) -> int:
         values = _portable(named)
-        if wrong := [name for name, value in values.items() if not is_array(value)]:
-            raise InvalidWeights(f"weights: {wrong[0]!r}: got {type(values[wrong[0]]).__name__}, want an array")
+        for name, value in values.items():
+            if not is_array(value):
+                raise InvalidWeights(f"weights: {name!r}: expected an array, got {type(value).__name__}")
         header = header_of(values)
         if len(header) > MESSAGE_BYTES:
             raise InvalidWeights(f"weights: {len(values)} names take {len(header)} bytes, the limit is {MESSAGE_BYTES}")
-        stated = {name: str(value).lower() for name, value in asdict(options).items() if value is not None}
-        with closing(open_websocket(f"{self._url}?{urlencode(stated)}", self._credentials, _ANSWER_S)) as socket:
-            unanswered, most = 0, 1  # the header alone is answered before any value is sent
-            for part in chain((header,), parts_of(values)):
+
+        query = {name: str(value).lower() for name, value in asdict(options).items() if value is not None}
+        with closing(open_websocket(f"{self._url}?{urlencode(query)}", self._credentials, _ANSWER_S)) as socket:
+            unanswered = 0
+            window = 1  # the header alone is answered before any value is sent
+            for message in chain((header,), parts_of(values)):
                 with suppress(ConnectionClosed, OSError):  # the server has refused the push; its answer has the reason
-                    socket.send(part, _ANSWER_S)
+                    socket.send(message, _ANSWER_S)
                 unanswered += 1
-                if unanswered >= most:
-                    answer, unanswered, most = self._answer(socket), unanswered - 1, _WINDOW
+                if unanswered >= window:
+                    answer = self._answer(socket)
+                    unanswered -= 1
+                    window = _WINDOW
             for _ in range(unanswered):
                 answer = self._answer(socket)
         return int(answer["version"])

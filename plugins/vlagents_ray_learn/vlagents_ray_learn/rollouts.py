@@ -43,9 +43,10 @@ class TransitionRecorder(EpisodeRecorder):
         self, _config: EvalConfig, _hz: float | None, *, want: Sequence[str] = (), images: bool = True
     ) -> None:
         self._pa: Any = optional("pyarrow")
-        self._want, self._images = tuple(want), images
+        self._want = tuple(want)
+        self._images = images
         self.request_info: Mapping[str, Any] = {WANT: list(want)} if want else {}
-        self._seen: dict[str, _Rows] = {}  # the columns of the observations
+        self._observed: dict[str, _Rows] = {}  # the columns of the observations
         self._rows: list[tuple[np.ndarray, float, bool, int, int, str]] = []  # action, reward, success, act, version …
         self._wanted: dict[str, list[float]] = {name: [] for name in self._want if name != REPLAY}
         self._acts = 0
@@ -59,32 +60,39 @@ class TransitionRecorder(EpisodeRecorder):
         return "all" if self._images else "none"
 
     def add_observation(self, obs: Obs) -> None:
-        seen: dict[str, Any] = {f"cameras.{name}": image for name, image in sorted(obs.cameras.items()) if self._images}
-        seen |= {f"state.{name}": part for name, part in sorted(obs.state.items())}
+        values: dict[str, Any] = {}
+        if self._images:
+            values |= {f"cameras.{name}": image for name, image in sorted(obs.cameras.items())}
+        values |= {f"state.{name}": array for name, array in sorted(obs.state.items())}
         if obs.gripper is not None:
-            seen["gripper"] = np.float32(obs.gripper)
-        got = {name: part.shape for name, part in seen.items()}
-        if not self._seen:
-            self._seen = {name: _Rows(part, np.uint8 if part.ndim == 3 else np.float32) for name, part in seen.items()}
-        elif got != (want := {name: rows.shape for name, rows in self._seen.items()}):
-            raise EnvFailed(f"env step: got {got}, want {want} as after reset")
-        for name, part in seen.items():
-            self._seen[name].add(part)
+            values["gripper"] = np.float32(obs.gripper)
+
+        if not self._observed:
+            for name, value in values.items():
+                dtype = np.uint8 if value.ndim == 3 else np.float32
+                self._observed[name] = _Rows(value, dtype)
+        expected = {name: rows.shape for name, rows in self._observed.items()}
+        got = {name: value.shape for name, value in values.items()}
+        if got != expected:
+            raise EnvFailed(f"env step: expected {expected} as after reset, got {got}")
+        for name, value in values.items():
+            self._observed[name].add(value)
 
     def add_act(self, act: Act, ticks_waited: int = 0) -> None:
         self._acts += 1
         self._version = version_of(act) or 0
         self._source = str(act.info.get("source", "policy"))
-        stated = act.info.get(BEHAVIOUR, {})
-        if lacking := [name for name in self._want if name not in stated]:
+        behaviour = act.info.get(BEHAVIOUR, {})
+        missing = [name for name in self._want if name not in behaviour]
+        if missing:
             raise ConfigError(
-                f"want: got no {' and no '.join(lacking)} in act.info[{BEHAVIOUR!r}], which has {sorted(stated)}; "
+                f"want: got no {' and no '.join(missing)} in act.info[{BEHAVIOUR!r}], which has {sorted(behaviour)}; "
                 f"take a policy that returns it, or leave it out of `want`"
             )
         rows = len(act.rows())
-        self._next = {name: _by_row(stated[name], rows, name) for name in self._wanted}
+        self._next = {name: _by_row(behaviour[name], rows, name) for name in self._wanted}
         if REPLAY in self._want:
-            self._next_replay = self._checked_replay(stated[REPLAY])
+            self._next_replay = self._checked_replay(behaviour[REPLAY])
 
     def add_action(self, action: np.ndarray, reward: float, success: bool) -> None:
         row = (np.array(action, np.float32), reward, success, self._acts - 1, self._version, self._source)
@@ -95,34 +103,36 @@ class TransitionRecorder(EpisodeRecorder):
             self._replay[name].add(value)
         self._next_replay = {}
 
-    def _checked_replay(self, stated: Any) -> dict[str, np.ndarray]:
+    def _checked_replay(self, replay: Any) -> dict[str, np.ndarray]:
         """Return an act's replay by name; its shapes must be those of the first act."""
-        values = dict(sorted(stated.items())) if isinstance(stated, Mapping) else {}
-        values = {name: np.asarray(value) for name, value in values.items()}
+        field = f"act.info[{BEHAVIOUR!r}][{REPLAY!r}]"
+        by_name = sorted(replay.items()) if isinstance(replay, Mapping) else []
+        values = {name: np.asarray(value) for name, value in by_name}
         if not values or any(value.dtype.kind not in "iuf" for value in values.values()):
-            raise ConfigError(
-                f"act.info[{BEHAVIOUR!r}][{REPLAY!r}]: got {stated!r}, want numbers and arrays of numbers by name"
-            )
+            raise ConfigError(f"{field}: expected numbers and arrays of numbers by name, got {replay!r}")
+
         if not self._replay:
             self._replay = {name: _Rows(value, value.dtype) for name, value in values.items()}
+        expected = {name: f"{rows.dtype} {rows.shape}" for name, rows in self._replay.items()}
         got = {name: f"{value.dtype} {value.shape}" for name, value in values.items()}
-        if got != (want := {name: f"{rows.dtype} {rows.shape}" for name, rows in self._replay.items()}):
-            raise ConfigError(f"act.info[{BEHAVIOUR!r}][{REPLAY!r}]: got {got}, want {want} as in the first act")
+        if got != expected:
+            raise ConfigError(f"{field}: expected {expected} as in the first act, got {got}")
         return values
 
     def finish(self, result: EpisodeResult, second_pass: SecondPass) -> Artifacts:
         """Return the transitions of a whole episode; none of one that an error of the policy ended."""
         if result.status != "done":
             return Artifacts()
-        pa, rows = self._pa, len(self._rows)
+        pa = self._pa
+        rows = len(self._rows)
         actions, rewards, success, acts, versions, sources = zip(*self._rows, strict=True)
         last = np.arange(rows) == rows - 1
-        seen = {name: column.all() for name, column in self._seen.items()}  # (T + 1, ...)
+        observed = {name: column.all() for name, column in self._observed.items()}  # (T + 1, ...)
         numbers: dict[str, np.ndarray] = {
             "episode": np.full(rows, result.key.episode, np.int64),
             "t": np.arange(rows, dtype=np.int32),
             "act": np.array(acts, np.int32),
-            **{name: values[:-1] for name, values in seen.items()},
+            **{name: values[:-1] for name, values in observed.items()},
             "action": np.stack(actions),
             "reward": np.array(rewards, np.float32),
             "terminated": last & (result.ending == "terminated"),
@@ -131,13 +141,17 @@ class TransitionRecorder(EpisodeRecorder):
             **{name: np.array(values, np.float32) for name, values in self._wanted.items()},
             "version": np.array(versions, np.int64),
         }
-        same = pa.array(np.zeros(rows, np.int32))  # the same text in each row
-        texts = {"key": str(result.key), "instruction": result.instruction}
-        columns = {name: pa.DictionaryArray.from_arrays(same, pa.array([text])) for name, text in texts.items()}
-        columns |= {name: tensors(pa, values) for name, values in numbers.items()}
-        columns |= {FINAL + name: at_rows(pa, values[-1:], last) for name, values in seen.items()}
-        begun = np.diff(acts, prepend=-1) != 0  # first rows of each act
-        columns |= {f"{REPLAY}.{name}": at_rows(pa, values.all(), begun) for name, values in self._replay.items()}
+        columns: dict[str, Any] = {}
+        zeros = pa.array(np.zeros(rows, np.int32))  # the same text in each row
+        for name, text in (("key", str(result.key)), ("instruction", result.instruction)):
+            columns[name] = pa.DictionaryArray.from_arrays(zeros, pa.array([text]))
+        for name, values in numbers.items():
+            columns[name] = tensors(pa, values)
+        for name, values in observed.items():
+            columns[FINAL + name] = at_rows(pa, values[-1:], last)
+        first_of_act = np.diff(acts, prepend=-1) != 0
+        for name, replayed in self._replay.items():
+            columns[f"{REPLAY}.{name}"] = at_rows(pa, replayed.all(), first_of_act)
         columns["source"] = pa.array(list(sources), pa.string()).dictionary_encode()
         return Artifacts(transitions=pa.RecordBatch.from_pydict(columns))
 
@@ -161,17 +175,19 @@ class _Rows:
         return self._rows[: self._number]
 
 
-def _by_row(stated: Any, rows: int, name: str) -> list[float]:
+def _by_row(value: Any, rows: int, name: str) -> list[float]:
     """Return a number for each row of an act: its own sum, or the act's total in the first and NaN in the others.
 
-    `stated` is a number; or (H,) or (H, D) numbers, H rows; or numbers of any other shape, such as one for each token,
+    `value` is a number; or (H,) or (H, D) numbers, H rows; or numbers of any other shape, such as one for each token,
     which are summed.
     """
-    values = np.asarray(stated, np.float64)
+    values = np.asarray(value, np.float64)
     if values.ndim and len(values) == rows:
         return [float(value) for value in values.reshape(rows, -1).sum(axis=1)]
     if name != "logprob" and values.size != 1:
-        raise ConfigError(f"act.info[{BEHAVIOUR!r}][{name!r}]: got shape {values.shape}, want a number, or ({rows},)")
+        raise ConfigError(
+            f"act.info[{BEHAVIOUR!r}][{name!r}]: expected a number, or shape ({rows},), got shape {values.shape}"
+        )
     return [float(values.sum()), *[float("nan")] * (rows - 1)]
 
 
@@ -232,10 +248,12 @@ class RolloutPlan:
 
     def __post_init__(self) -> None:
         for name, least in (("groups", 1), ("first", 0), ("seed", 0)):
-            if (value := getattr(self, name)) < least:
-                raise ConfigError(f"{name}: got {value}, want at least {least}")
-        if unknown := sorted(set(self.want) - set(WANTED)):
-            raise ConfigError(f"want: got {unknown}, want some of {list(WANTED)}")
+            value = getattr(self, name)
+            if value < least:
+                raise ConfigError(f"{name}: expected at least {least}, got {value}")
+        unknown = sorted(set(self.want) - set(WANTED))
+        if unknown:
+            raise ConfigError(f"want: expected some of {list(WANTED)}, got {unknown}")
 
     def config(self) -> EvalConfig:
         """Return the settings of an evaluation of these episodes; nothing is written."""
@@ -324,8 +342,9 @@ class Rollouts(AbstractContextManager["Rollouts"], Iterator[Any]):
 
         A thread hands later episodes to the workers meanwhile, also until the next call: two for each environment.
         """
-        while not (delivered := self._deliver(self._position + 1, self._limit())):
-            pass  # it was lost
+        delivered: list[Any] = []
+        while not delivered:  # an episode may be lost
+            delivered = self._deliver(self._position + 1, self._limit())
         return delivered[0]
 
     def collect(self, episodes: int) -> Any:
@@ -344,9 +363,12 @@ class Rollouts(AbstractContextManager["Rollouts"], Iterator[Any]):
             VLAgentsError: The last infrastructure error, after `abort_after` lost episodes in a row.
         """
         if episodes < 1 or episodes % self._settings.groups:
-            raise ConfigError(f"collect: got {episodes} episodes, want a multiple of groups, {self._settings.groups}")
-        while not (batches := self._deliver(self._position + episodes)):
-            pass  # all were lost
+            raise ConfigError(
+                f"collect: expected a multiple of groups, {self._settings.groups}, got {episodes} episodes"
+            )
+        batches: list[Any] = []
+        while not batches:  # all may be lost
+            batches = self._deliver(self._position + episodes)
         try:
             return self._pa.Table.from_batches(batches)
         except (self._pa.ArrowInvalid, ValueError) as error:
@@ -391,15 +413,19 @@ class Rollouts(AbstractContextManager["Rollouts"], Iterator[Any]):
 
     def _saw(self, version: int) -> None:
         """Note the version of an act or of a push."""
-        if version > self._version:
-            if delivered := self._position - self._since:
-                self._pace, self._since = (delivered, version - self._version), self._position
-            self._version = version
+        if version <= self._version:
+            return
+        delivered = self._position - self._since
+        if delivered:
+            self._pace = delivered, version - self._version
+            self._since = self._position
+        self._version = version
 
     def _deliver(self, end: int, limit: int | None = None) -> list[Any]:
         """Play until the episodes before number `end` are over; those before `limit` may also begin, and go on."""
         try:
-            if ahead := limit is not None and self._settings.workers > 0:
+            ahead = limit is not None and self._settings.workers > 0
+            if ahead:
                 self._start_player()
             else:
                 self._stop_player()
@@ -502,7 +528,9 @@ class Rollouts(AbstractContextManager["Rollouts"], Iterator[Any]):
             self._episodes[job.key].pushed = self._pushed
 
     def _handle(self, job: Job, report: Report) -> None:
-        failure, transitions, episode = report.failure, report.artifacts.transitions, self._episodes[job.key]
+        failure = report.failure
+        transitions = report.artifacts.transitions
+        episode = self._episodes[job.key]
         if failure is not None and failure.cause == "user":
             raise from_code(failure.code, failure.message)
         if failure is not None and self._attempts.repeats(job, failure):
@@ -511,18 +539,21 @@ class Rollouts(AbstractContextManager["Rollouts"], Iterator[Any]):
             return
         if transitions is not None:
             transitions = self._with_start_state(transitions, episode.number // self._settings.groups)
-        episode.over, episode.transitions = True, transitions
+        episode.over = True
+        episode.transitions = transitions
         if transitions is None:
             self.stats.lost += 1
-            error = report.result.error if report.result is not None else None
-            self._attempts.note_lost(failure or Failure("policy", PolicyFailed.code, f"{job.key}: {error}"), _CURE)
+            if failure is None:
+                error = report.result.error if report.result is not None else None
+                failure = Failure("policy", PolicyFailed.code, f"{job.key}: {error}")
+            self._attempts.note_lost(failure, _CURE)
             return
         self._attempts.note_played()
         versions = transitions.column("version").to_numpy()
         episode.oldest = int(versions.min())
         self._saw(int(versions.max()))
-        most = self._settings.max_lag
-        if most is not None and episode.pushed - episode.oldest > most:  # it would always be too old
+        max_lag = self._settings.max_lag
+        if max_lag is not None and episode.pushed - episode.oldest > max_lag:  # it would always be too old
             raise WeightsLost(
                 f"version: {job.key} began when rollouts.version had been set to {episode.pushed}, but its acts name "
                 f"{episode.oldest}; set it to what a push returned, after it has (a policy that names none has 0), and "
@@ -534,7 +565,9 @@ class Rollouts(AbstractContextManager["Rollouts"], Iterator[Any]):
         for episode in reversed(self._episodes.values()):
             lag = self._version - episode.oldest if episode.transitions is not None else 0
             if self._settings.max_lag is not None and lag > self._settings.max_lag:
-                episode.over, episode.held, episode.transitions = False, True, None
+                episode.over = False
+                episode.held = True
+                episode.transitions = None
                 self.stats.stale += 1
             if episode.held and episode.number < self._allowed:
                 episode.held = False

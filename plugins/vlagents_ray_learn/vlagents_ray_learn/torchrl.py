@@ -36,7 +36,10 @@ torch: Any = require("torch")
 nn: Any = optional("tensordict.nn", "torchrl")
 vla: Any = optional("torchrl.data.vla", "torchrl")
 IMAGE, STATE, TEXT = vla.IMAGE_KEY, vla.STATE_KEY, vla.INSTRUCTION_KEY
-_CAMERA, _PART, _TOKENS, _LEARNED = "front", "state", "tokens", ("logprob", REPLAY)
+_CAMERA = "front"
+_STATE_PART = "state"
+_TOKENS = "tokens"
+_LEARNED = ("logprob", REPLAY)  # values of an action that a learner needs
 
 
 class ServedPolicy(nn.TensorDictModuleBase):  # type: ignore[misc]
@@ -51,45 +54,76 @@ class ServedPolicy(nn.TensorDictModuleBase):  # type: ignore[misc]
     def __init__(self, url: str, **options: Any) -> None:
         """Set the server, to which the first call connects; the arguments are those of `RemoteAgent`."""
         super().__init__()
-        self.in_keys, self.out_keys = [IMAGE, STATE, TEXT], [vla.ACTION_CHUNK_KEY, "policy_version"]
-        self._url, self._options = url, {"rank": "simulation", **options}
+        self.in_keys = [IMAGE, STATE, TEXT]
+        self.out_keys = [vla.ACTION_CHUNK_KEY, "policy_version"]
+        self._url = url
+        self._options = {"rank": "simulation", **options}
         self._sessions: list[RemoteAgent] = []
 
     def forward(self, batch: Any) -> Any:
-        """Add the policy's acts to a tensordict of observations, and return it; raises the errors of `RemoteAgent`."""
+        """Add the policy's answers to a tensordict of observations, and return it.
+
+        Raises:
+            VLAgentsError: As for `RemoteAgent`.
+        """
         rows = batch.reshape(-1)
-        obs, words, first = [*map(_observation, rows)], rows.get(TEXT), rows.get("is_init", None)
-        words = [words] * len(obs) if isinstance(words, str) else words.tolist()
-        if not self._sessions:
-            self._sessions, self._words = [RemoteAgent(self._url, **self._options)], dict[int, str]()
-            self._contract, self._seeds = self._sessions[0].contract or Contract(), np.random.default_rng()
-        agent = self._sessions[0]
-        self._sessions += agent.sessions(len(obs) - len(self._sessions))
-        results: list[Any] = []
-        begun = [i for i, text in enumerate(words) if self._words.get(i) != text or (first is not None and first[i])]
-        if begun:
-            of_begun: Any = zip(*((obs[i], words[i], self._sessions[i]) for i in begun), strict=True)
-            results += agent.reset_batch(*of_begun, seeds=self._seeds.integers(2**31, size=len(begun)).tolist())
-            self._words |= {i: words[i] for i in begun}
+        obs = [_observation(row) for row in rows]
+        text = rows.get(TEXT)
+        instructions = [text] * len(obs) if isinstance(text, str) else text.tolist()
+        self._open_sessions(len(obs))
+        self._begin_episodes(obs, instructions, rows.get("is_init", None))
+
         if nn.probabilistic.interaction_type() == nn.InteractionType.RANDOM:
             want = [name for name in _LEARNED if name in (self._contract.behaviour or ())]
-            obs = [Obs(one.cameras, state=one.state, info={WANT: want}) for one in obs]
-        results += agent.act_batch(obs, self._sessions[: len(obs)])
-        for error in (one for one in results if isinstance(one, Exception)):
-            raise error
-        for key, values in self._outputs(results[-len(obs) :]).items():
-            batch.set(key, torch.from_numpy(np.stack(values)).reshape((*batch.batch_size, *values[0].shape)))
+            obs = [Obs(sent.cameras, state=sent.state, info={WANT: want}) for sent in obs]
+        answers = _without_errors(self._sessions[0].act_batch(obs, self._sessions[: len(obs)]))
+        for key, values in self._outputs(answers).items():
+            shape = (*batch.batch_size, *values[0].shape)
+            batch.set(key, torch.from_numpy(np.stack(values)).reshape(shape))
         return batch
 
-    def _outputs(self, acts: Sequence[Act]) -> dict[Any, list[np.ndarray]]:
-        found: dict[Any, Any] = {"policy_version": [np.array(act.info[POLICY]["version"], np.int64) for act in acts]}
+    def _open_sessions(self, number: int) -> None:
+        """Connect at the first call, and open sessions until there are that many."""
+        if not self._sessions:
+            agent = RemoteAgent(self._url, **self._options)
+            self._sessions = [agent]
+            self._instructions: dict[int, str] = {}  # of the running episode, by row
+            self._contract = agent.contract or Contract()
+            self._seeds = np.random.default_rng()
+        self._sessions += self._sessions[0].sessions(number - len(self._sessions))
+
+    def _begin_episodes(self, obs: Sequence[Obs], instructions: Sequence[str], is_first: Any) -> None:
+        """Reset the sessions of the rows whose episode begins; `is_first` marks them, and may be None."""
+        begun = []
+        for i, instruction in enumerate(instructions):
+            changed = self._instructions.get(i) != instruction
+            if changed or (is_first is not None and is_first[i]):
+                begun.append(i)
+        if not begun:
+            return
+        seeds = self._seeds.integers(2**31, size=len(begun)).tolist()
+        results = self._sessions[0].reset_batch(
+            [obs[i] for i in begun],
+            [instructions[i] for i in begun],
+            [self._sessions[i] for i in begun],
+            seeds=seeds,
+        )
+        _without_errors(results)
+        self._instructions |= {i: instructions[i] for i in begun}
+
+    def _outputs(self, answers: Sequence[Act]) -> dict[Any, list[np.ndarray]]:
+        """Return the values of each row by TorchRL's keys."""
+        versions = [np.array(answer.info[POLICY]["version"], np.int64) for answer in answers]
+        outputs: dict[Any, list[np.ndarray]] = {"policy_version": versions}
         if self._contract.action.space != _TOKENS:
-            found[vla.ACTION_CHUNK_KEY] = [act.rows() for act in acts]
-        stated = [act.info.get(BEHAVIOUR, {}) for act in acts]
-        if all(_TOKENS in one.get(REPLAY, {}) for one in stated):
-            found[vla.ACTION_TOKENS_KEY] = [np.array(one[REPLAY][_TOKENS], np.int64) for one in stated]
-            found[vla.VLA_ACTION_KEY, "log_probs"] = [np.array(one["logprob"], np.float32) for one in stated]
-        return found
+            outputs[vla.ACTION_CHUNK_KEY] = [answer.rows() for answer in answers]
+        behaviours = [answer.info.get(BEHAVIOUR, {}) for answer in answers]
+        if all(_TOKENS in behaviour.get(REPLAY, {}) for behaviour in behaviours):
+            tokens = [np.array(behaviour[REPLAY][_TOKENS], np.int64) for behaviour in behaviours]
+            logprobs = [np.array(behaviour["logprob"], np.float32) for behaviour in behaviours]
+            outputs[vla.ACTION_TOKENS_KEY] = tokens
+            outputs[vla.VLA_ACTION_KEY, "log_probs"] = logprobs
+        return outputs
 
     def close(self) -> None:
         """End the sessions; a later call begins others."""
@@ -115,11 +149,13 @@ class TorchRLPolicy(Agent):
 
     @property
     def contract(self) -> Contract | None:
-        if (policy := self.policy) is None:
+        policy = self.policy
+        if policy is None:
             return None
-        tokens = policy.action_head == "tokens"
-        action = ActionSpec(policy.action_dim, _TOKENS if tokens and policy.action_tokenizer is None else None)
-        return Contract(action=action, chunk=policy.chunk_size, behaviour=_LEARNED if tokens else None)
+        has_tokens = policy.action_head == "tokens"
+        space = _TOKENS if has_tokens and policy.action_tokenizer is None else None
+        action = ActionSpec(policy.action_dim, space)
+        return Contract(action=action, chunk=policy.chunk_size, behaviour=_LEARNED if has_tokens else None)
 
     def initialize(self) -> None:
         from ray import cloudpickle
@@ -137,14 +173,18 @@ class TorchRLPolicy(Agent):
         set_values(self.policy, named)
 
     def reset(self, obs: Obs, instruction: str | None, **kwargs: Any) -> dict[str, Any]:
-        self._words, self._draws = instruction or "", np.random.default_rng(int(kwargs.get("seed") or 0) % 2**64)
+        self._instruction = instruction or ""
+        self._draws = np.random.default_rng(int(kwargs.get("seed") or 0) % 2**64)
         return {}
 
     def act_batch(self, obs: Sequence[Obs], sessions: Sequence[Any]) -> list[Act | Exception]:
-        return of_good([attempt(_row, one, session) for one, session in zip(obs, sessions, strict=True)], self._acts)
+        rows = [attempt(_row, received, session) for received, session in zip(obs, sessions, strict=True)]
+        return of_good(rows, self._acts)
 
     def _acts(self, rows: list[tuple[Any, np.random.Generator | None]]) -> Iterable[Act]:
-        policy, device = self.policy, next(self.policy.parameters()).device
+        """Compute one batch; each row has an input, and the generator of its draw, or None for the likeliest tokens."""
+        policy = self.policy
+        device = next(policy.parameters()).device
         batch = torch.stack([row for row, _ in rows]).contiguous().to(device)
         with torch.no_grad():
             if policy.action_head == "continuous":
@@ -156,8 +196,12 @@ class TorchRLPolicy(Agent):
             tokens = (logits + torch.from_numpy(np.stack(noise)).to(device, logits.dtype)).argmax(-1)
             logprobs = distribution.log_prob(tokens)  # (B,), or (B, H, D) with `log_probs_mode="token"`
             actions = tokens if policy.action_tokenizer is None else policy.action_tokenizer.decode(tokens)
-        found = zip(*(one.cpu().numpy() for one in (actions.float(), tokens, logprobs.float())), strict=True)
-        return [Act(act, info={BEHAVIOUR: {"logprob": logp, REPLAY: {_TOKENS: own}}}) for act, own, logp in found]
+        acts = []
+        outputs = zip(_on_host(actions.float()), _on_host(tokens), _on_host(logprobs.float()), strict=True)
+        for action, drawn, logprob in outputs:
+            behaviour = {"logprob": logprob, REPLAY: {_TOKENS: drawn}}
+            acts.append(Act(action, info={BEHAVIOUR: behaviour}))
+        return acts
 
 
 class ServerAddress:
@@ -185,8 +229,10 @@ class PolicyServer:
         self, *, policy_factory: Any, transport: Any, server_config: Any = None, policy_device: Any = "cpu", **_: Any
     ) -> None:
         if not isinstance(transport, ServerAddress):
-            raise ConfigError(f"transport: got {type(transport).__name__}, want ServerAddress; import both names")
-        self.transport, self._factory, self._running = transport, policy_factory, ExitStack()
+            raise ConfigError(f"transport: expected ServerAddress, got {type(transport).__name__}; import both names")
+        self.transport = transport
+        self._factory = policy_factory
+        self._running = ExitStack()
         self._batch = {} if server_config is None else {"max_size": server_config.max_batch_size}
         self._resources = {"num_gpus": float(torch.device(policy_device).type == "cuda")}
 
@@ -200,10 +246,15 @@ class PolicyServer:
         from vlagents_ray_learn.publisher import Publisher
 
         with ExitStack() as stack:
-            file = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="vlr-torchrl-"))) / "factory"
+            folder = stack.enter_context(tempfile.TemporaryDirectory(prefix="vlr-torchrl-"))
+            file = Path(folder) / "factory"
             file.write_bytes(cloudpickle.dumps(self._factory))
-            path = {"env_vars": {"PYTHONPATH": os.pathsep.join(filter(None, sys.path))}}  # of the factory's modules
-            args: dict[str, Any] = {"batch": self._batch, "resources": self._resources, "environment": path}
+            module_path = os.pathsep.join(filter(None, sys.path))  # of the factory's modules
+            args: dict[str, Any] = {
+                "batch": self._batch,
+                "resources": self._resources,
+                "environment": {"env_vars": {"PYTHONPATH": module_path}},
+            }
             plan = deployment(f"{__name__}:TorchRLPolicy", config={"factory": str(file)}, **args)
             stack.enter_context(running_server(plan, port=self.transport.port))
             self._publisher = Publisher(f"serve://{plan.applications[0].name}")
@@ -222,17 +273,34 @@ class PolicyServer:
         self._running.close()
 
 
+def _without_errors(results: Sequence[Any]) -> Sequence[Any]:
+    """Return the results of a batch; raises the first error among them."""
+    for result in results:
+        if isinstance(result, Exception):
+            raise result
+    return results
+
+
+def _on_host(values: Any) -> np.ndarray:
+    """Return a tensor as an array."""
+    array: np.ndarray = values.cpu().numpy()
+    return array
+
+
 def _observation(row: Any) -> Obs:
+    """Return the observation in a row of a tensordict."""
     image, state = row.get(IMAGE, None), row.get(STATE, None)
-    cameras = {} if image is None else {_CAMERA: image.movedim(0, -1).contiguous().cpu().numpy()}
-    return Obs(cameras, state={} if state is None else {_PART: state.float().cpu().numpy()})
+    cameras = {} if image is None else {_CAMERA: _on_host(image.movedim(0, -1).contiguous())}
+    parts = {} if state is None else {_STATE_PART: _on_host(state.float())}
+    return Obs(cameras, state=parts)
 
 
 def _row(obs: Obs, session: TorchRLPolicy) -> tuple[Any, np.random.Generator | None]:
     """Return a session's input for the policy, and the generator of its draw, if any."""
-    row = optional("tensordict", "torchrl").TensorDict({TEXT: session._words}, [])
+    row = optional("tensordict", "torchrl").TensorDict({TEXT: session._instruction}, [])
     if IMAGE in session.policy.in_keys:
-        row[IMAGE] = torch.from_numpy(camera_images(obs, {_CAMERA: _CAMERA})[_CAMERA].copy()).movedim(-1, 0)
+        image = camera_images(obs, {_CAMERA: _CAMERA})[_CAMERA]
+        row[IMAGE] = torch.from_numpy(image.copy()).movedim(-1, 0)
     if STATE in session.policy.in_keys:
-        row[STATE] = torch.from_numpy(state_vector(obs, [_PART]))
+        row[STATE] = torch.from_numpy(state_vector(obs, [_STATE_PART]))
     return row, session._draws if obs.info.get(WANT) else None

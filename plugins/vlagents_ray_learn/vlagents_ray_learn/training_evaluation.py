@@ -56,16 +56,19 @@ class TrainingEvaluation:
             UnknownEnv: There is no such env.
         """
         if not isinstance(policy, str | Agent):
-            raise ConfigError(f"policy: got {type(policy).__name__}, want an Agent, or the URL of its server")
+            raise ConfigError(f"policy: expected an Agent, or the URL of its server, got {type(policy).__name__}")
         if not 0 < share <= 1:
-            raise ConfigError(f"share: got {share}, want a part of the trainer's time in (0, 1]")
+            raise ConfigError(f"share: expected a part of the trainer's time in (0, 1], got {share}")
         if len(plan.policies) != 1 or plan.policies[0].steps:
-            raise ConfigError(f"plan: got the policies {[one.name for one in plan.policies]}, want one without steps")
+            names = [configured.name for configured in plan.policies]
+            raise ConfigError(f"plan: expected one policy without steps, got {names}")
         if (plan.out / FILE).is_file() and not plan.resume:
             raise ConfigError(f"{plan.out} already has results: set resume=True in the plan, or choose another folder")
         require_envs(plan)
-        self._policy, self._plan = policy, plan.model_copy(update={"resume": True})
-        self._share, self._progress = share, progress
+        self._policy = policy
+        self._plan = plan.model_copy(update={"resume": True})
+        self._share = share
+        self._progress = progress
         self._began = monotonic()
         self._spent_s = self._last_s = 0.0
 
@@ -97,26 +100,36 @@ class TrainingEvaluation:
         """
         begun = monotonic()
         try:
-            if isinstance(agent := self._policy, str):
-                transport, timeout_s = self._plan.policies[0].transport, self._plan.connect_timeout_s
-                with RemoteAgent(agent, transport=transport, connect_timeout_s=timeout_s) as remote:
-                    newest = (remote.metadata.get("policy_version") or {}).get("newest") or {}
-                if newest.get("version") != version:
-                    raise WeightsLost(
-                        f"version: got {version}, but the newest that {agent} acts with is {newest.get('version')}; "
-                        f"want what the last push returned, once `acknowledged` counts all replicas"
-                    )
-                return evaluate(self._of(PushedWeights(**newest), url=agent), progress=self._progress)
-            pushed = PushedWeights(version=version, fingerprint=fingerprint(agent.parameters()))
-            session = _EvaluatedSession(agent, AgentCopies(agent), pushed)
-            with evaluation_mode(None if agent.trainable is None else attrgetter(agent.trainable)(agent)):
-                plan = self._of(pushed).model_copy(update={"workers": 0})
-                return evaluate(plan, agent_factory=lambda: session, progress=self._progress)
+            if isinstance(self._policy, str):
+                return self._evaluate_server(self._policy, version)
+            return self._evaluate_agent(self._policy, version)
         finally:
             self._last_s = monotonic() - begun
             self._spent_s += self._last_s
 
-    def _of(self, pushed: PushedWeights, url: str | None = None) -> EvalConfig:
+    def _evaluate_server(self, url: str, version: int) -> Summary:
+        """Evaluate the policy of a server, whose newest version must be this one."""
+        transport, timeout_s = self._plan.policies[0].transport, self._plan.connect_timeout_s
+        with RemoteAgent(url, transport=transport, connect_timeout_s=timeout_s) as remote:
+            newest = (remote.metadata.get("policy_version") or {}).get("newest") or {}
+        if newest.get("version") != version:
+            raise WeightsLost(
+                f"version: got {version}, but the newest that {url} acts with is {newest.get('version')}; "
+                f"use what the last push returned, once `acknowledged` counts all replicas"
+            )
+        return evaluate(self._plan_for(PushedWeights(**newest), url=url), progress=self._progress)
+
+    def _evaluate_agent(self, agent: Agent, version: int) -> Summary:
+        """Evaluate an agent of this process with its present weights."""
+        pushed = PushedWeights(version=version, fingerprint=fingerprint(agent.parameters()))
+        session = _EvaluatedSession(agent, AgentCopies(agent), pushed)
+        module = None if agent.trainable is None else attrgetter(agent.trainable)(agent)
+        with evaluation_mode(module):
+            plan = self._plan_for(pushed).model_copy(update={"workers": 0})
+            return evaluate(plan, agent_factory=lambda: session, progress=self._progress)
+
+    def _plan_for(self, pushed: PushedWeights, url: str | None = None) -> EvalConfig:
+        """Return the plan of an evaluation of one version."""
         policy = self._plan.policies[0].model_copy(update={"source": None, "url": url, "pushed_weights": pushed})
         return self._plan.model_copy(update={"policies": [policy]})
 

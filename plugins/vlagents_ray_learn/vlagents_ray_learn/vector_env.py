@@ -26,30 +26,36 @@ _RESET_MASK = "reset_mask"  # Gymnasium's name of the option
 def action_space(contract: Contract) -> Any:
     """Return Box (D,) float32 within the contract's bounds; raises `ConfigError` if the contract lacks D."""
     spec = contract.action
-    low, high = (-np.inf if spec.low is None else spec.low), (np.inf if spec.high is None else spec.high)
-    return gymnasium.spaces.Box(low, high, (_stated(spec.dim, "action.dim"),), np.float32)
+    low = -np.inf if spec.low is None else spec.low
+    high = np.inf if spec.high is None else spec.high
+    dim = _size(spec.dim, "action.dim")
+    return gymnasium.spaces.Box(low, high, (dim,), np.float32)
 
 
 def observation_space(contract: Contract, observation: Observation) -> Any:
     """Return the space of `observed`; raises `ConfigError` if the contract does not state a size."""
     spaces = gymnasium.spaces
-    state = {
-        f"state/{name}": spaces.Box(-np.inf, np.inf, (_stated(spec.dim, f"state {name!r}: dim"),), np.float32)
-        for name, spec in sorted((contract.state or {}).items())
-    }
+    state = {}
+    for name, part in sorted((contract.state or {}).items()):
+        dim = _size(part.dim, f"state {name!r}: dim")
+        state[f"state/{name}"] = spaces.Box(-np.inf, np.inf, (dim,), np.float32)
     if contract.gripper:
         state["gripper"] = spaces.Box(0.0, 1.0, (1,), np.float32)
+
     if observation == "all":
-        cameras = {
-            f"cameras/{name}": spaces.Box(
-                0, 255, (_stated(one.height, f"{name}: height"), _stated(one.width, f"{name}: width"), 3), np.uint8
-            )
-            for name, one in sorted((contract.cameras or {}).items())
-        }
+        cameras = {}
+        for name, camera in sorted((contract.cameras or {}).items()):
+            height = _size(camera.height, f"{name}: height")
+            width = _size(camera.width, f"{name}: width")
+            cameras[f"cameras/{name}"] = spaces.Box(0, 255, (height, width, 3), np.uint8)
         return spaces.Dict(cameras | state)
+
     if not state:
-        raise ConfigError("observation: got 'state', but the env's contract has none and no gripper; want 'all'")
-    low, high = (np.concatenate([getattr(part, bound) for part in state.values()]) for bound in ("low", "high"))
+        raise ConfigError(
+            "observation: expected 'all', as the env's contract has neither a state nor a gripper, got 'state'"
+        )
+    low = np.concatenate([space.low for space in state.values()])
+    high = np.concatenate([space.high for space in state.values()])
     return spaces.Box(low, high, dtype=np.float32)
 
 
@@ -66,12 +72,14 @@ def observed(obs: Obs, observation: Observation) -> Any:
         state["gripper"] = np.array([obs.gripper], np.float32)
     if observation == "state":
         return np.concatenate(list(state.values()))
-    return {f"cameras/{name}": np.array(image) for name, image in sorted(obs.cameras.items())} | state
+    cameras = {f"cameras/{name}": np.array(image) for name, image in sorted(obs.cameras.items())}
+    return cameras | state
 
 
-def _stated(size: int | None, what: str) -> int:
+def _size(size: int | None, field: str) -> int:
+    """Return a size of the contract; raises `ConfigError` if the contract leaves it open."""
     if size is None:
-        raise ConfigError(f"{what}: the env's contract does not state it, but Gymnasium wants to know; state it there")
+        raise ConfigError(f"{field}: the env's contract does not state it, but Gymnasium needs it; state it there")
     return size
 
 
@@ -109,9 +117,11 @@ def as_vector_env(
         MissingDependency: Gymnasium or the simulator is not installed.
         UnknownEnv: The name or the task is unknown.
     """
-    for name, got, known in (("observation", observation, Observation), ("autoreset", autoreset, Autoreset)):
-        if got not in get_args(known):
-            raise ConfigError(f"{name}: got {got!r}, want one of {list(get_args(known))}")
+    choices = (("observation", observation, Observation), ("autoreset", autoreset, Autoreset))
+    for name, choice, literal in choices:
+        known = list(get_args(literal))
+        if choice not in known:
+            raise ConfigError(f"{name}: expected one of {known}, got {choice!r}")
     batch = make_batch(env, num_envs, **(env_options or {}))
     try:
         return BatchVectorEnv(batch, observation, vector.AutoresetMode[autoreset.upper()], reset_options)
@@ -149,7 +159,9 @@ class BatchVectorEnv(vector.VectorEnv):  # type: ignore[misc]
         Raises:
             ConfigError: The environments' contract does not state a size.
         """
-        self._batch, self._observation, self._reset_options = batch, observation, dict(reset_options or {})
+        self._batch = batch
+        self._observation = observation
+        self._reset_options = dict(reset_options or {})
         self.autoreset_mode = autoreset
         self._contract = batch.contract
         self.num_envs = batch.num_envs
@@ -162,7 +174,7 @@ class BatchVectorEnv(vector.VectorEnv):  # type: ignore[misc]
         self._begun = 0  # episodes
         self._over = np.zeros(self.num_envs, np.bool_)
         self._steps = np.zeros(self.num_envs, np.int64)
-        self._seen: list[Obs] = []  # the current observation of each; none before the first reset
+        self._obs: list[Obs] = []  # the current observation of each; none before the first reset
 
     def reset(
         self, *, seed: int | Sequence[int | None] | None = None, options: dict[str, Any] | None = None
@@ -178,22 +190,28 @@ class BatchVectorEnv(vector.VectorEnv):  # type: ignore[misc]
         Returns:
             The observations, and the infos.
         """
-        given = dict(options or {})
-        which, n = given.pop(_RESET_MASK, None), self.num_envs
-        which = np.ones(n, np.bool_) if which is None else which
-        if not isinstance(which, np.ndarray) or which.dtype != np.bool_ or which.shape != (n,) or not which.any():
-            raise ConfigError(f"{_RESET_MASK}: got {which!r}, want a bool array of shape ({n},), true somewhere")
-        stated = None if seed is None or isinstance(seed, int) else _seeds(seed, which)
-        super().reset(seed=seed if stated is None else stated[0])
-        if stated is not None:
-            self._seed, self._begun = max(stated) + 1 - len(stated), 0
+        env_options = dict(options or {})
+        mask = self._checked_mask(env_options.pop(_RESET_MASK, None))
+        seeds = None if seed is None or isinstance(seed, int) else _seeds(seed, mask)
+        super().reset(seed=seed if seeds is None else seeds[0])
+        if seeds is not None:
+            self._seed, self._begun = max(seeds) + 1 - len(seeds), 0
         elif isinstance(seed, int):
             self._seed, self._begun = seed, 0
         elif self._seed is None:
             self._seed = int(self.np_random.integers(2**31))
         infos: dict[str, Any] = {}
-        self._begin(which, infos, given, stated)
+        self._begin(mask, infos, env_options, seeds)
         return self._observations(), infos
+
+    def _checked_mask(self, mask: Any) -> np.ndarray:
+        """Return which environments a reset begins an episode in, (N,) bool; None is all of them."""
+        if mask is None:
+            return np.ones(self.num_envs, np.bool_)
+        shape = (self.num_envs,)
+        if not isinstance(mask, np.ndarray) or mask.dtype != np.bool_ or mask.shape != shape or not mask.any():
+            raise ConfigError(f"{_RESET_MASK}: expected a bool array of shape {shape}, true somewhere, got {mask!r}")
+        return mask
 
     def step(self, actions: np.ndarray) -> tuple[Any, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
         """Execute an action in each environment.
@@ -204,7 +222,7 @@ class BatchVectorEnv(vector.VectorEnv):  # type: ignore[misc]
         Returns:
             The observations, rewards (N,) float64, terminated (N,) bool, truncated (N,) bool, and the infos.
         """
-        if not self._seen:
+        if not self._obs:
             raise NotReset("step before reset; call reset(seed=...) first")
         if self._over.any() and self.autoreset_mode == vector.AutoresetMode.DISABLED:
             raise NotReset(
@@ -213,23 +231,35 @@ class BatchVectorEnv(vector.VectorEnv):  # type: ignore[misc]
             )
         rows = np.asarray(actions, np.float32)
         if rows.shape != self.action_space.shape:
-            raise InvalidAction(f"actions: got {rows.shape}, want {self.action_space.shape}, a row an environment")
+            raise InvalidAction(
+                f"actions: expected shape {self.action_space.shape}, a row for each environment, got {rows.shape}"
+            )
         rewards = np.zeros(self.num_envs)
-        terminated, truncated = np.zeros(self.num_envs, np.bool_), np.zeros(self.num_envs, np.bool_)
+        terminated = np.zeros(self.num_envs, np.bool_)
+        truncated = np.zeros(self.num_envs, np.bool_)
         infos: dict[str, Any] = {}
-        restarted, moving = self._over.copy(), ~self._over  # episodes can be over only in mode "next_step"
+
+        restarted = self._over.copy()  # episodes can be over only in mode "next_step"
+        moving = ~restarted
         if restarted.any():
             self._begin(restarted, infos)
+
+        resets_at_once = self.autoreset_mode == vector.AutoresetMode.SAME_STEP
         for i, step, info in self._moved(rows, moving):
-            rewards[i], terminated[i], self._seen[i] = step.reward, step.terminated, step.obs
-            truncated[i] = not step.terminated and (step.truncated or self._steps[i] >= self._batch.max_steps)
+            self._obs[i] = step.obs
+            rewards[i] = step.reward
+            terminated[i] = step.terminated
+            out_of_steps = self._steps[i] >= self._batch.max_steps
+            truncated[i] = not step.terminated and (step.truncated or out_of_steps)
             self._over[i] = terminated[i] or truncated[i]
             if self._batch.several_tasks:
                 info["instruction"] = self._batch.instructions[i]
-            last = self._over[i] and self.autoreset_mode == vector.AutoresetMode.SAME_STEP
-            said = {"final_obs": observed(step.obs, self._observation), "final_info": info} if last else info
-            self._add_info(infos, said, i)
-        if self._over.any() and self.autoreset_mode == vector.AutoresetMode.SAME_STEP:
+            if self._over[i] and resets_at_once:
+                final = {"final_obs": observed(step.obs, self._observation), "final_info": info}
+                self._add_info(infos, final, i)
+            else:
+                self._add_info(infos, info, i)
+        if resets_at_once and self._over.any():
             self._begin(self._over.copy(), infos)
         return self._observations(), rewards, terminated, truncated, infos
 
@@ -240,65 +270,75 @@ class BatchVectorEnv(vector.VectorEnv):  # type: ignore[misc]
         """Step the environments that are `moving`; return the number, the outputs and the info of each."""
         if not moving.any():
             return []
-        self._batch.looked_at = images = self._observation == "all"
+        images = self._observation == "all"
+        self._batch.looked_at = images
         with env_side("step"):
             acts = [Act(row) if moves else None for row, moves in zip(rows, moving, strict=True)]
-            seen, rewards, terminated, truncated, infos = self._batch.step(acts)
-            for error in (info[ERROR] for info in infos if ERROR in info):
-                raise error
+            obs, rewards, terminated, truncated, infos = self._batch.step(acts)
+            for info in infos:
+                if ERROR in info:
+                    raise info[ERROR]
         self._steps += moving
-        outputs = [*zip(seen, rewards, terminated, truncated, infos, strict=True)]
-        return [
-            (i, checked_step(*outputs[i], self._contract, images=images), dict(infos[i]))
-            for i in np.flatnonzero(moving).tolist()
-        ]
+        moved = []
+        for i in np.flatnonzero(moving).tolist():
+            step = checked_step(
+                obs[i], rewards[i], terminated[i], truncated[i], infos[i], self._contract, images=images
+            )
+            moved.append((i, step, dict(infos[i])))
+        return moved
 
     def _begin(
         self,
-        which: np.ndarray,
+        mask: np.ndarray,
         infos: dict[str, Any],
-        given: Mapping[str, Any] | None = None,
-        stated: Sequence[int] | None = None,
+        env_options: Mapping[str, Any] | None = None,
+        chosen_seeds: Sequence[int] | None = None,
     ) -> None:
-        """Begin an episode in these environments, and add its infos."""
+        """Begin an episode in the environments of a mask, (N,) bool, and add its infos."""
         assert self._seed is not None  # noqa: S101 - `reset` has set it
-        chosen = np.flatnonzero(which).tolist()
-        if not which.all() and not self._batch.restarts:
+        chosen = np.flatnonzero(mask).tolist()
+        if not mask.all() and not self._batch.restarts:
             raise ConfigError(
                 f"{len(chosen)} of {self.num_envs} episodes are over, and this simulator resets all its environments "
-                f"together; want one whose episodes end together, as those of a step limit do, or num_envs=1"
+                f"together; use one whose episodes end together, as those of a step limit do, or num_envs=1"
             )
-        if not which.all() and not self._seen:
+        if not mask.all() and not self._obs:
             raise NotReset(f"reset: got a {_RESET_MASK} before the first reset; call reset(seed=...) for all first")
         numbers = range(self._begun, self._begun + len(chosen))
-        seeds = stated or [self._seed + number for number in numbers]
-        merged = {**self._reset_options, **(given or {})}
+        seeds = chosen_seeds or [self._seed + number for number in numbers]
+        merged = {**self._reset_options, **(env_options or {})}
         options = [options_of_reset(self._batch, number, merged) for number in numbers]
         with env_side("reset"):
-            if which.all():
-                self._seen = [*self._batch.reset(seeds=seeds, options=options)]
+            if mask.all():
+                self._obs = list(self._batch.reset(seeds=seeds, options=options))
             else:
                 for i, seed, option in zip(chosen, seeds, options, strict=True):
-                    self._seen[i] = self._batch.restart(i, seed=seed, options=option)
+                    self._obs[i] = self._batch.restart(i, seed=seed, options=option)
             instructions = self._batch.instructions
         self._begun += len(chosen)
-        self._over[which], self._steps[which] = False, 0
+        self._over[mask] = False
+        self._steps[mask] = 0
         for i, seed in zip(chosen, seeds, strict=True):
-            checked_obs(self._seen[i], self._contract, "reset")
+            checked_obs(self._obs[i], self._contract, "reset")
             self._add_info(infos, {"instruction": instructions[i], "episode_seed": seed}, i)
 
     def _observations(self) -> Any:
-        rows = [observed(obs, self._observation) for obs in self._seen]
+        rows = [observed(obs, self._observation) for obs in self._obs]
         if self._observation == "state":
             return np.stack(rows)
         return {name: np.stack([row[name] for row in rows]) for name in self.single_observation_space}
 
 
-def _seeds(seeds: Sequence[int | None], which: np.ndarray) -> list[int]:
+def _seeds(seeds: Sequence[int | None], mask: np.ndarray) -> list[int]:
     """Return the seeds of the environments that begin an episode, from a list for all environments."""
-    if len(seeds) != which.size:
-        raise InvalidInput(f"seed: got {len(seeds)} seeds, want {which.size}, one for each environment")
-    found = [seeds[i] for i in np.flatnonzero(which).tolist()]
-    if not found or not all(isinstance(one, (int, np.integer)) and one >= 0 for one in found):
-        raise InvalidInput(f"seed: got {list(seeds)}, want a whole number for each environment that begins an episode")
-    return [int(one) for one in found if one is not None]
+    if len(seeds) != mask.size:
+        raise InvalidInput(f"seed: expected {mask.size} seeds, one for each environment, got {len(seeds)}")
+    chosen = []
+    for i in np.flatnonzero(mask).tolist():
+        seed = seeds[i]
+        if not isinstance(seed, (int, np.integer)) or seed < 0:
+            raise InvalidInput(
+                f"seed: expected a whole number for each environment that begins an episode, got {list(seeds)}"
+            )
+        chosen.append(int(seed))
+    return chosen
