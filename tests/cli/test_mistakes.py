@@ -229,8 +229,10 @@ COMMANDS: dict[str, tuple[list[str], list[str]]] = {
     "env make: a module": (["env", "make", "own.py", "--out", "e"], ["own.py", "requirements file"]),
     "replay: nothing there": (["replay", "nowhere"], ["nowhere", "results.db"]),
     "replay: no episode": (["replay", "done"], ["got no episode, want a key as ['tabletop#0@0:"]),
-    "replay: no policy": (["replay", "dataset"], ["--policy"]),
-    "replay: episodes": (["replay", "dataset", "--policy", "noop", "--only", "a-b"], ["'a-b'", "0-9,12"]),
+    "replay: a dataset": (["replay", "dataset"], ["dataset", "results.db"]),
+    "open-loop: nothing there": (["open-loop", "nowhere", "--policy", "noop"], ["nowhere", "LeRobotDataset"]),
+    "open-loop: no policy": (["open-loop", "dataset"], ["--policy"]),
+    "open-loop: episodes": (["open-loop", "dataset", "--policy", "noop", "--only", "a-b"], ["'a-b'", "0-9,12"]),
 }
 MADE = {"env setting negative"}  # mistakes that are found when the environment is made, after the folder of results
 # In this process, until the policy's error: (policy, parts of the message).

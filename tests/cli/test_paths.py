@@ -38,6 +38,8 @@ COMMANDS: dict[tuple[str, str], list[str]] = {
     ("merge", "--out"): ["done", "--out", "{path}"],
     ("replay", "folder"): ["{path}", "tabletop#0"],
     ("replay", "--out"): ["done", "tabletop#0", "--out", "{path}"],
+    ("open-loop", "folder"): ["{path}", "--policy", "noop"],
+    ("open-loop", "--out"): ["absent", "--policy", "noop", "--out", "{path}"],
     ("bundle", "folder"): ["{path}", "--out", "x.zip"],
     ("bundle", "--out"): ["done", "--out", "{path}"],
     ("verify", "bundle"): ["{path}"],
@@ -60,7 +62,7 @@ USABLE = {("report", "--out", "text"), ("export", "--out", "text"), ("bundle", "
 USABLE |= {("slurm serve", "--out", path) for path in PATHS} | {("slurm serve", "--setup", "text")}
 USABLE |= {("slurm eval", "--setup", "text")}
 # A folder that does not exist is made, with its parents.
-MADE = {"eval", "demo", "merge", "slurm eval", "slurm serve", "replay", "verify", "env make"}
+MADE = {"eval", "demo", "merge", "slurm eval", "slurm serve", "replay", "open-loop", "verify", "env make"}
 
 
 def commands(command: Any, name: str = "") -> Iterator[tuple[str, Any]]:

@@ -30,7 +30,7 @@ from vlagents_ray.serve.engine.engine import Engine
 from vlagents_ray.serve.local_agent import LocalAgent
 from vlagents_ray.serve.observers import episodes
 from vlagents_ray_learn.open_loop.command import parse_episodes
-from vlagents_ray_learn.open_loop.comparison import OpenLoopPlan, OpenSession, candidate, compare
+from vlagents_ray_learn.open_loop.comparison import OpenLoopPlan, OpenSession, candidate, compare, open_datasets
 from vlagents_ray_learn.open_loop.recorded_dataset import Names, RecordedDataset
 
 
@@ -76,7 +76,7 @@ def demonstrate(folder: Path, frames: int = 6) -> None:
 def test_the_same_checkpoint_makes_no_error(tmp_path: Path) -> None:
     record(tmp_path)
     with loaded(Brightness()) as open_session:
-        result = compare(tmp_path, open_session, OpenLoopPlan()).to_json()
+        result = compare(open_datasets(tmp_path), open_session, OpenLoopPlan()).to_json()
     assert (result["mae"], result["max"], result["frames"], result["sessions"]) == (0.0, 0.0, 12, 3)
     assert result["against"] == "answers"
 
@@ -84,7 +84,7 @@ def test_the_same_checkpoint_makes_no_error(tmp_path: Path) -> None:
 def test_another_checkpoint_makes_an_error_by_joint_and_by_step(tmp_path: Path) -> None:
     record(tmp_path)
     with loaded(Brightness(gain=1.5, chunk=3)) as open_session:
-        result = compare(tmp_path, open_session, OpenLoopPlan(at_once=2)).to_json()
+        result = compare(open_datasets(tmp_path), open_session, OpenLoopPlan(at_once=2)).to_json()
     assert len(result["by_step"]) == 3, "as many rows as both have"
     assert [one["frames"] for one in result["by_step"]] == [12] * 3
     assert result["by_joint"][1]["joint"] == "action_1"
@@ -95,16 +95,16 @@ def test_another_checkpoint_makes_an_error_by_joint_and_by_step(tmp_path: Path) 
 def test_noise_of_the_same_seeds_makes_no_error_and_of_others_it_does(tmp_path: Path) -> None:
     record(tmp_path, Random.from_config({"action_dim": 2}))
     with loaded(Random.from_config({"action_dim": 2})) as open_session:
-        assert compare(tmp_path, open_session, OpenLoopPlan()).to_json()["max"] == 0
+        assert compare(open_datasets(tmp_path), open_session, OpenLoopPlan()).to_json()["max"] == 0
     with loaded(Random.from_config({"action_dim": 2, "seed": 1})) as open_session:
-        assert compare(tmp_path, open_session, OpenLoopPlan()).to_json()["max"] > 0
+        assert compare(open_datasets(tmp_path), open_session, OpenLoopPlan()).to_json()["max"] > 0
 
 
 def test_a_session_of_several_episodes_is_reset_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(episodes, "_FRAMES", 3)
     record(tmp_path)
     with loaded(Brightness()) as open_session:
-        result = compare(tmp_path, open_session, OpenLoopPlan()).to_json()
+        result = compare(open_datasets(tmp_path), open_session, OpenLoopPlan()).to_json()
     assert (result["max"], len(result["by_episode"]), result["sessions"]) == (0.0, 6, 3)
 
 
@@ -117,13 +117,13 @@ def test_missing_acts_are_told(tmp_path: Path) -> None:
         server.recorder._held_bytes = held
         robot.act(seen(2))
     with loaded(Brightness()) as open_session:
-        assert compare(tmp_path, open_session, OpenLoopPlan()).to_json()["missing_acts"] == 1
+        assert compare(open_datasets(tmp_path), open_session, OpenLoopPlan()).to_json()["missing_acts"] == 1
 
 
 def test_the_actions_of_a_dataset_without_answers_are_those_of_the_frames_ahead(tmp_path: Path) -> None:
     demonstrate(tmp_path)
     with loaded(Follow()) as open_session:
-        result = compare(tmp_path, open_session, OpenLoopPlan()).to_json()
+        result = compare(open_datasets(tmp_path), open_session, OpenLoopPlan()).to_json()
     assert (result["against"], result["frames"], result["max"]) == ("actions", 12, 0.0)
     assert [one["frames"] for one in result["by_step"]] == [12, 10, 8], "to the end of each episode"
 
@@ -131,7 +131,7 @@ def test_the_actions_of_a_dataset_without_answers_are_those_of_the_frames_ahead(
 def test_every_nth_frame_of_some_episodes_and_a_shorter_horizon(tmp_path: Path) -> None:
     demonstrate(tmp_path)
     with loaded(Follow()) as open_session:
-        result = compare(tmp_path, open_session, OpenLoopPlan([1], horizon=2, every=4)).to_json()
+        result = compare(open_datasets(tmp_path), open_session, OpenLoopPlan([1], horizon=2, every=4)).to_json()
     assert [one["frames"] for one in result["by_step"]] == [2, 2]
     assert [one["episode"] for one in result["by_episode"]] == [1]
 
@@ -168,7 +168,7 @@ def test_a_public_dataset_of_the_older_version_with_other_names(tmp_path: Path) 
     (tmp_path / "meta/info.json").write_text(json.dumps(info))
     (tmp_path / "meta/episodes.jsonl").write_text('{"episode_index": 0, "tasks": ["count"], "length": 4}\n')
     with loaded(Follow()) as open_session:
-        result = compare(tmp_path, open_session, OpenLoopPlan()).to_json()
+        result = compare(open_datasets(tmp_path), open_session, OpenLoopPlan()).to_json()
     assert (result["max"], result["by_joint"][1]["joint"]) == (0.0, "elbow")
     dataset = RecordedDataset(tmp_path)
     [session] = dataset.sessions()
@@ -194,7 +194,7 @@ def test_a_state_that_cannot_be_divided_names_the_option(tmp_path: Path) -> None
 def test_a_policy_of_another_robot_is_refused(tmp_path: Path) -> None:
     demonstrate(tmp_path)
     with loaded(Random.from_config({"action_dim": 7})) as open_session, pytest.raises(ConfigError, match="7"):
-        compare(tmp_path, open_session, OpenLoopPlan())
+        compare(open_datasets(tmp_path), open_session, OpenLoopPlan())
 
 
 def test_an_error_of_the_policy_says_where(tmp_path: Path) -> None:
@@ -206,13 +206,13 @@ def test_an_error_of_the_policy_says_where(tmp_path: Path) -> None:
 
     demonstrate(tmp_path)
     with loaded(Fails()) as open_session, pytest.raises(PolicyFailed, match="episode 0, frame 3"):
-        compare(tmp_path, open_session, OpenLoopPlan(at_once=1))
+        compare(open_datasets(tmp_path), open_session, OpenLoopPlan(at_once=1))
 
 
 def test_a_server_at_a_url_is_asked_in_the_same_way(tmp_path: Path) -> None:
     record(tmp_path)
     with live_server(Brightness()) as server, candidate(server.url) as open_session:
-        result = compare(tmp_path, open_session, OpenLoopPlan(at_once=2)).to_json()
+        result = compare(open_datasets(tmp_path), open_session, OpenLoopPlan(at_once=2)).to_json()
     assert (result["max"], result["frames"]) == (0.0, 12)
 
 
@@ -258,9 +258,17 @@ def test_numbers_and_ranges() -> None:
     assert list(parse_episodes("0-2,7")) == [0, 1, 2, 7]
 
 
-def test_a_folder_without_a_dataset(tmp_path: Path) -> None:
-    with loaded(Follow()) as open_session, pytest.raises(ConfigError, match="LeRobotDataset"):
-        compare(tmp_path, open_session, OpenLoopPlan())
+def test_a_folder_without_a_dataset_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match="LeRobotDataset"):
+        open_datasets(tmp_path)
+
+
+@pytest.mark.parametrize("text", ["", "[", "[]", "{}", '{"codebase_version": "v3.0"}'])
+def test_a_broken_description_of_a_dataset_is_named(text: str, tmp_path: Path) -> None:
+    (tmp_path / "meta").mkdir()
+    (tmp_path / "meta/info.json").write_text(text)
+    with pytest.raises(ConfigError, match=str(tmp_path)):
+        open_datasets(tmp_path)
 
 
 def test_datasets_of_other_actions_are_not_mixed(tmp_path: Path) -> None:
@@ -268,5 +276,5 @@ def test_datasets_of_other_actions_are_not_mixed(tmp_path: Path) -> None:
     record(tmp_path / "two")
     shutil.move(next((tmp_path / "two").iterdir()), tmp_path / "three")
     (tmp_path / "two").rmdir()
-    with loaded(Follow()) as open_session, pytest.raises(ConfigError, match="one by one"):
-        compare(tmp_path, open_session, OpenLoopPlan())
+    with pytest.raises(ConfigError, match="one by one"):
+        open_datasets(tmp_path)

@@ -35,15 +35,22 @@ def open_loop_command(
     printed, and written as JSON.
     """
     with errors():
-        from vlagents_ray_learn.open_loop.comparison import OpenLoopPlan, candidate, compare, write_result
+        from vlagents_ray_learn.open_loop.comparison import (
+            OpenLoopPlan,
+            candidate,
+            compare,
+            open_datasets,
+            write_result,
+        )
         from vlagents_ray_learn.open_loop.recorded_dataset import Names
 
         names = Names(parse_camera_map(camera_map or ""), None if state is None else parse_list(state))
         episodes = None if only is None else parse_episodes(only)
         plan = OpenLoopPlan(episodes, horizon, every, at_once, names)
+        datasets = open_datasets(folder)
         into = out_dir or fresh(Path("runs/open_loop"))
         with candidate(policy) as open_session:
-            result = compare(folder, open_session, plan)
+            result = compare(datasets, open_session, plan)
 
         table = result.to_json()
         out.print(

@@ -165,22 +165,38 @@ class OpenLoopResult:
         }
 
 
-def compare(folder: Path, open_session: OpenSession, plan: OpenLoopPlan) -> OpenLoopResult:
+def open_datasets(folder: Path) -> list[RecordedDataset]:
+    """Open a LeRobotDataset, or all in a folder.
+
+    Raises:
+        ConfigError: There is none, or their actions differ.
+    """
+    files = [path for pattern in ("", "*/") for path in sorted(folder.glob(f"{pattern}meta/info.json"))]
+    if not files:
+        raise ConfigError(f"{folder}: expected a LeRobotDataset, or a folder of them, got no meta/info.json")
+    datasets = [RecordedDataset(path.parents[1]) for path in files]
+    first = datasets[0]
+    for other in datasets[1:]:
+        if len(other.joints) != len(first.joints) or other.traced != first.traced:
+            raise ConfigError(f"{other.root}: has other actions than {first.root}; compare them one by one")
+    return datasets
+
+
+def compare(datasets: Sequence[RecordedDataset], open_session: OpenSession, plan: OpenLoopPlan) -> OpenLoopResult:
     """Query a policy at each frame, and compare its actions with those of the dataset.
 
     A session is reset with its first recorded observation, its instruction and its options, and then receives each of
     its observations in order, whatever its answers are.
 
     Args:
-        folder: A LeRobotDataset, or a folder of them.
+        datasets: The result of `open_datasets`.
         open_session: Opens a session of the policy.
         plan: The settings.
 
     Raises:
-        ConfigError: There is no dataset, its actions do not fit the policy's, or a name is unknown.
+        ConfigError: The actions of a dataset do not fit the policy's, or a name is unknown.
         PolicyFailed: The policy raised an error, or refused an observation.
     """
-    datasets = _datasets(folder)
     first = datasets[0]
     sessions = [session for dataset in datasets for session in dataset.sessions(plan.episodes)]
     against = "answers" if first.traced else "actions"
@@ -213,19 +229,6 @@ def compare(folder: Path, open_session: OpenSession, plan: OpenLoopPlan) -> Open
             threads.shutdown(wait=False, cancel_futures=True)
             raise
     return result
-
-
-def _datasets(folder: Path) -> list[RecordedDataset]:
-    """Open the datasets in a folder; raises `ConfigError` if there is none, or if their actions differ."""
-    files = [path for pattern in ("", "*/") for path in sorted(folder.glob(f"{pattern}meta/info.json"))]
-    if not files:
-        raise ConfigError(f"{folder}: expected a LeRobotDataset, or a folder of them, got no meta/info.json")
-    datasets = [RecordedDataset(path.parents[1]) for path in files]
-    first = datasets[0]
-    for other in datasets[1:]:
-        if len(other.joints) != len(first.joints) or other.traced != first.traced:
-            raise ConfigError(f"{other.root}: has other actions than {first.root}; compare them one by one")
-    return datasets
 
 
 def _fitting(expected: np.ndarray, actions: np.ndarray, episode: RecordedEpisode) -> np.ndarray:

@@ -79,11 +79,11 @@ class RecordedDataset:
         self.root = root
         self._pq: Any = require("pyarrow.parquet")
         self._av: Any = require("av")
-        self.info: dict[str, Any] = json.loads((root / "meta/info.json").read_text())
+        self.info = _read_info(root / "meta/info.json")
         self.version = str(self.info.get("codebase_version"))
         if not self.version.startswith(("v3.", "v2.")):
             raise ConfigError(f"{root}: expected a LeRobotDataset v3.0, v2.1 or v2.0, got {self.version}; convert it")
-        self.features: dict[str, Any] = self.info["features"]
+        self.features: dict[str, Any] = self.info.get("features") or {}
         if ACTION not in self.features:
             raise ConfigError(f"{root}: expected {ACTION!r} among its features, got {sorted(self.features)}")
         contract = self.info.get(INFO)
@@ -272,6 +272,17 @@ class RecordedDataset:
         if STATE in widths:
             features[STATE] = state_parts(widths[STATE], policy, names.state, option="--state joints,gripper")
         return features
+
+
+def _read_info(file: Path) -> dict[str, Any]:
+    """Read the description of a dataset; raises `ConfigError` if it is no JSON object."""
+    try:
+        info = json.loads(file.read_text())
+    except ValueError as error:
+        raise ConfigError(f"{file}: expected JSON, got an error, {error}; is the file complete?") from error
+    if not isinstance(info, dict):
+        raise ConfigError(f"{file}: expected a JSON object, got {type(info).__name__}")
+    return info
 
 
 def _embedded_image(value: Mapping[str, Any]) -> np.ndarray:
