@@ -15,8 +15,8 @@ vlagents-ray eval tabletop/lift --policy scripted --episodes "$episodes" --worke
   --env-set width=48 --env-set height=48 --env-set pucks=1 --env-set object_state=true --out "$out/demos"
 
 # 2. A dataset without cameras, with the place of the puck as the environment's state.
-vlagents-ray export "$out/demos" --out "$out/dataset" --to lerobot --successes --cut-idle --cameras '' \
-  --state xyzrpy,gripper,puck --environment-state puck
+vlagents-ray export "$out/demos" --out "$out/dataset" --to lerobot --set successes=true --set cut_idle=true \
+  --set 'cameras=[]' --set 'state=[xyzrpy,gripper,puck]' --set 'environment_state=[puck]'
 
 # 3. LeRobot's own command trains, in the background, and is ended if this script is.
 .venv-lerobot/bin/lerobot-train --dataset.repo_id=local/lift --dataset.root="$out/dataset" --output_dir="$out/train" \

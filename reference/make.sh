@@ -9,9 +9,9 @@ export PYTHONPATH=examples:reference # the experts of Meta-World; the control
 export MALLOC_ARENA_MAX=1 MALLOC_MMAP_THRESHOLD_=33554432 MALLOC_TRIM_THRESHOLD_=8589934592
 for robot in tabletop metaworld; do
   "$bin/vlagents-ray" eval "reference/demonstrations/$robot.yaml" --out "$runs/$robot" --resume
-  [ "$robot" = tabletop ] && objects=(--environment-state puck,target) || objects=()
+  [ "$robot" = tabletop ] && objects=(--set "environment_state=[puck,target]") || objects=()
   [ -d "$runs/data/$robot" ] ||
-    "$bin/vlagents-ray" export "$runs/$robot" --out "$runs/data/$robot" --to lerobot --successes "${objects[@]}"
+    "$bin/vlagents-ray" export "$runs/$robot" --out "$runs/data/$robot" --to lerobot --set successes=true "${objects[@]}"
 done
 [ -d "$runs/checkpoint" ] ||
   "$bin/python" reference/train.py "$runs/data" "$runs/checkpoint" --work "$runs/train" --every 2 \

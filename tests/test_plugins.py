@@ -122,7 +122,7 @@ def test_a_command_that_cannot_be_loaded_is_an_error_that_names_its_plugin(
         file.write("COMMAND = RegistryEntry('lab_policies.command:run')\n")
     install("lab-policies", commands=f"lab = {value}")
     with pytest.raises(ConfigError, match=message):
-        registry.load_command("lab")
+        registry.registered_function("commands", "lab")
 
 
 def test_a_policy_whose_module_raises_is_listed_with_its_error(install: Install, tmp_path: Path) -> None:

@@ -1,9 +1,10 @@
 """Names of policies, environments, robots, commands and others, the location of their code, and their requirements.
 
 A name leads to a `RegistryEntry`, whose class is imported only when it is used. Plug-ins add entries through the
-entry-point groups `vlagents_ray.policies`, `.wrappers`, `.envs`, `.dialects`, `.robots`, `.leaders`, `.commands` and
-`.replica`: an entry point names a `RegistryEntry` in a module that imports nothing large. A `"module:Class"` in a
-deployment file works without registration. Wrappers change the observations of any policy, or its actions.
+entry-point groups `vlagents_ray.policies`, `.wrappers`, `.envs`, `.dialects`, `.robots`, `.leaders`, `.commands`,
+`.replica`, `.exports` and `.trackers`: an entry point names a `RegistryEntry` in a module that imports nothing large. A
+`"module:Class"` in a deployment file works without registration. Wrappers change the observations of any policy, or its
+actions.
 
 The tables of README and docs/ are made from these entries: `python tests/support/tables.py`.
 """
@@ -34,11 +35,11 @@ CORE = "vlagents-ray"  # the distribution of this package
 class RegistryEntry:
     """A policy, wrapper, environment, dialect, robot or command: where its code is, what it is, and what it needs."""
 
-    # "module:Class". Of a leader, "module:function" (see `robot.leaders.OpenLeader`). Of a command, "module:function"
+    # "module:Class". Of an export and a leader (see `robot.leaders.OpenLeader`), "module:function". Of a command, that
     # or "module:app", a typer.Typer; the function of a subcommand, such as "robot.check", takes the arguments and
     # returns the exit status.
     target: str
-    # Its models or tasks, for the tables of README and docs/; empty: no row in them. Of a command, one line for --help.
+    # Its models or tasks, for the tables of README and docs/; empty: no row in them. Of others, one line for --help.
     about: str = ""
     needs: tuple[str, ...] = ()  # import names; the first one may be in a source named by `checkouts`
     requirements: tuple[str, ...] = ()  # files of requirements/ that install these, the usual one first
@@ -175,6 +176,13 @@ WRAPPERS: dict[str, RegistryEntry] = {
     "absolute_actions": RegistryEntry("vlagents_ray.policies.absolute_actions:AbsoluteActions"),
 }
 
+# Formats of `vlagents-ray export`. A function (results, path, **settings) writes the episodes and returns their number;
+# its keyword-only parameters are the settings of `--set`.
+EXPORTS: dict[str, RegistryEntry] = {
+    "json": RegistryEntry("vlagents_ray.evaluate.exports:to_json", "an object for each episode"),
+    "csv": RegistryEntry("vlagents_ray.evaluate.exports:to_csv", "a line for each episode"),
+}
+
 _BUILT_IN: dict[str, dict[str, RegistryEntry]] = {
     "policies": POLICIES,
     "wrappers": WRAPPERS,
@@ -184,6 +192,8 @@ _BUILT_IN: dict[str, dict[str, RegistryEntry]] = {
     "leaders": {},  # operators' devices, `vlagents-ray robot --leader NAME`
     "commands": {},  # those of this package are in `cli.main`; "robot.NAME" is a subcommand of `vlagents-ray robot`
     "replica": {},  # parts of a replica
+    "exports": EXPORTS,
+    "trackers": {},  # classes like `evaluate.trackers.TrackerRun`
 }
 _SINGULAR = {
     "policies": "policy",
@@ -194,6 +204,8 @@ _SINGULAR = {
     "leaders": "leader",
     "commands": "command",
     "replica": "part of a replica",
+    "exports": "export format",
+    "trackers": "tracker",
 }
 
 # extra of this package -> import names of what it installs, beside those of the adapters
@@ -215,7 +227,7 @@ _EXTRAS: dict[str, tuple[str, ...]] = {
     "sim": ("gymnasium",),
     "record": ("av", "pyarrow"),
     "otel": ("opentelemetry",),
-    **{name: (name,) for name in ("wandb", "trackio", "tensorboard", "rerun")},
+    "rerun": ("rerun",),
 }
 
 # import name -> how to install a package that is in no extra and no file of requirements/
@@ -276,6 +288,14 @@ def _install(package: str, extra: str | None = None, distribution: str = CORE) -
             f"the deployment's `environment`{family}"
         )
     return _ELSEWHERE.get(package, f"install the package that provides {package!r}")
+
+
+def require_needs(kind: str, name: str) -> None:
+    """Raise `MissingDependency` if a package that a registered name needs is not installed."""
+    entry = find_entry(kind, name)
+    if entry is not None:
+        for module in entry.needs:
+            require(module, extra=entry.extra, distribution=entry.distribution)
 
 
 def pip_install(extra: str | None = None, distribution: str = CORE) -> str:

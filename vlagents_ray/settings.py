@@ -15,7 +15,7 @@ from vlagents_ray.errors import ConfigError, shown
 from vlagents_ray.naming import did_you_mean
 
 _BOUNDS = ("less_than", "less_than_equal", "greater_than", "greater_than_equal")
-_WORD_ERRORS = ("int_parsing", "float_parsing", "bool_parsing", "list_type", *_BOUNDS)
+_WORD_ERRORS = ("int_parsing", "float_parsing", "bool_parsing", "list_type", "sequence_str", *_BOUNDS)
 # How to write a value, by the type of error and the type of the value.
 _SPELLINGS = {
     ("list_type", dict): "; begin each of its entries with '- '",
@@ -98,7 +98,7 @@ def _sentence(item: Mapping[str, Any], model: type | None, option: str | None) -
     if item["type"] in _WORD_ERRORS and isinstance(item["input"], str):  # in place of a number or a list: no secret
         got = shown(item["input"])
         message = message.partition(", unable to")[0]
-        if item["type"] == "list_type":
+        if item["type"] in ("list_type", "sequence_str"):
             message += f", such as [{item['input'][:40]}]"
     if item["type"] == "literal_error" and isinstance(item["input"], str):  # a word of a list is no secret
         got = shown(item["input"])

@@ -28,7 +28,7 @@ from vlagents_ray.cli.ray_session import quiet_ray
 from vlagents_ray.client import RemoteAgent
 from vlagents_ray.errors import ConfigError, PolicyUnavailable, WeightsLost
 from vlagents_ray.evaluate import EvalConfig, PolicyConfig, SuiteConfig, Summary, print_summary
-from vlagents_ray.evaluate.plan.config import Count, Seed, Tracker
+from vlagents_ray.evaluate.plan.config import Count, Seed
 from vlagents_ray.serve.launch.deployment_file import deployment, together
 from vlagents_ray.serve.launch.server import running_server
 from vlagents_ray_learn import Publisher, RolloutPlan, Rollouts, TrainingEvaluation, arrays
@@ -63,7 +63,7 @@ class LearnPlan(BaseModel):
     held_out: Count = 200  # episodes of an evaluation, the same for each version
     workers: Count = 2
     num_envs: Count = 16  # environments of a worker
-    track: list[Tracker] = []  # trackers that show success rates beside `out`, against the optimizer's steps
+    track: list[str] = []  # trackers that show success rates beside `out`, against the optimizer's steps
 
 
 class MethodParts(NamedTuple):

@@ -211,8 +211,16 @@ COMMANDS: dict[str, tuple[list[str], list[str]]] = {
     "report: nothing there": (["report", "nowhere"], ["nowhere", "results"]),
     "report: empty database": (["report", "emptied"], ["results.db", "empty file"]),
     "report: text as database": (["report", "texted"], ["results.db"]),
+    "eval: tracker": (
+        ["eval", "tabletop", "--policy", "noop", "--track", "wandbb", "--dry-run", "--out", "o"],
+        ["'wandbb' is not registered", "'wandb'"],
+    ),
     "export: kind": (["export", "nowhere", "--out", "x.csv", "--to", "xlsx"], ["'xlsx'", "csv"]),
-    "export: folder": (["export", "nowhere", "--out", "no/x.csv", "--to", "csv"], ["no", "make it first"]),
+    "export: setting": (
+        ["export", "done", "--out", "x.csv", "--to", "csv", "--set", "cut_idle=true"],
+        ["--set, for --to csv", "cut_idle: there is no such setting"],
+    ),
+    "export: folder": (["export", "done", "--out", "no/x.csv", "--to", "csv"], ["no", "make it first"]),
     "bundle: folder": (["bundle", "nowhere", "--out", "no/x.zip"], ["no/x.zip", "make it first"]),
     "export: a folder as the file": (["export", "done", "--to", "csv", "--out", "."], ["expected a file", "folder"]),
     "bundle: a folder as the file": (["bundle", "done", "--out", "."], ["expected a file", "folder"]),

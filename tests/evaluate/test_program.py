@@ -17,15 +17,16 @@ from in_process_evaluation import flat_config
 from vlagents_ray.errors import ConfigError
 from vlagents_ray.evaluate import EvalConfig, Results, compare, evaluate
 from vlagents_ray.evaluate.episode.records import EnvInfo, EpisodeResult
-from vlagents_ray.evaluate.exports.tables import rows
-from vlagents_ray.evaluate.merge import combined, merge
+from vlagents_ray.evaluate.exports import rows
 from vlagents_ray.evaluate.plan.cases import cells
 from vlagents_ray.evaluate.plan.jobs import plan
 from vlagents_ray.evaluate.report.page import write_report
 from vlagents_ray.evaluate.report.success import compare_all, families_json
+from vlagents_ray.evaluate.results.combination import combined
 from vlagents_ray.evaluate.results.store import Store
 from vlagents_ray.evaluate.results.summary import summarize
 from vlagents_ray.policies.base.program import code_of_class, digest_of, files_named
+from vlagents_ray_results.merge import merge
 
 FILES = {
     "prog_env.py": "from prog_parts.sea import CURRENT\nfrom eval_fakes import Line\nclass Sea(Line):\n    pass\n",

@@ -15,14 +15,14 @@ from in_process_evaluation import play
 
 from vlagents_ray.errors import ConfigError
 from vlagents_ray.evaluate import EvalConfig, Results, evaluate
+from vlagents_ray.evaluate import exports as tables
 from vlagents_ray.evaluate.episode.records import EpisodeResult
-from vlagents_ray.evaluate.exports import tables
-from vlagents_ray.evaluate.merge import merge
 from vlagents_ray.evaluate.plan.cases import cells
 from vlagents_ray.evaluate.plan.config import PushedWeights
 from vlagents_ray.evaluate.replay import actions_difference, compare, find
 from vlagents_ray.evaluate.results.store import Store
 from vlagents_ray.interface import Act, Obs
+from vlagents_ray_results.merge import merge
 
 Config = Callable[..., EvalConfig]
 

@@ -15,9 +15,9 @@ import yaml
 from vlagents_ray import Act
 from vlagents_ray.envs.tabletop import Tabletop
 from vlagents_ray.evaluate import EvalConfig, evaluate
-from vlagents_ray.evaluate.exports.lerobot import to_lerobot
 from vlagents_ray.evaluate.results.reader import Results
 from vlagents_ray.policies.scripted import Scripted
+from vlagents_ray_results.lerobot import to_lerobot
 
 torch = pytest.importorskip("torch")
 pytestmark = pytest.mark.torch

@@ -13,9 +13,9 @@ from typing import Any
 import pytest
 
 from vlagents_ray.evaluate import EvalConfig, Results, SuiteConfig, evaluate
-from vlagents_ray.evaluate.bundle import verify
 from vlagents_ray.evaluate.results.statistics import wilson
 from vlagents_ray.policies.reference import Reference
+from vlagents_ray_results.verification import verify
 
 torch = pytest.importorskip("torch")
 pytestmark = pytest.mark.torch

@@ -115,7 +115,7 @@ def error_codes() -> Iterator[str]:
 
 def registered() -> Iterator[str]:
     registry = importlib.import_module("vlagents_ray.registry")
-    for kind in ("policies", "wrappers", "envs", "dialects", "robots", "leaders"):
+    for kind in ("policies", "wrappers", "envs", "dialects", "robots", "leaders", "exports", "trackers"):
         yield f"{kind}: {', '.join(sorted(registry.names(kind)))}"
 
 
@@ -184,7 +184,7 @@ def series() -> list[str]:
 
 
 def columns() -> Iterator[str]:
-    tables = importlib.import_module("vlagents_ray.evaluate.exports.tables")
+    tables = importlib.import_module("vlagents_ray.evaluate.exports")
     yield from (f"{one.name}: {one.type}" for one in tables.COLUMNS)
 
 

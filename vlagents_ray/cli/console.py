@@ -112,16 +112,6 @@ def say_error(message: str, console: Console | None = None) -> None:
     (console or err).print(Text.assemble(("error", "bold red"), f" {message}"))
 
 
-def require_folder_of(file: Path) -> None:
-    """Raise `ConfigError` unless a command can write this file: its folder exists, and it is not a folder itself."""
-    if file.is_dir():
-        raise ConfigError(f"{file}: expected a file, got a folder; add the name of a file")
-    if not file.absolute().parent.is_dir():
-        raise ConfigError(
-            f"{file}: expected a file in a folder that exists, got no folder {file.parent}; make it first"
-        )
-
-
 def fresh(folder: Path) -> Path:
     """Return `folder`, or the first of folder-2, folder-3, … that does not exist, so that results never mix.
 

@@ -92,7 +92,7 @@ class EvalOptions:
     ] = None
     video: Annotated[str | None, typer.Option(help="none, failures (default) or all.")] = None
     record: Annotated[str | None, typer.Option(help="Trajectories: none (default), failures or all.")] = None
-    track: Annotated[str, typer.Option(help="wandb, trackio, tensorboard, with commas between them.")] = ""
+    track: Annotated[str, typer.Option(help="Trackers such as wandb, with commas between them.")] = ""
     resume: Annotated[bool, typer.Option("--resume", help="Go on with the results in --out.")] = False
     accept_changes: Annotated[
         bool,

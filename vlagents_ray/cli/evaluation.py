@@ -39,6 +39,7 @@ from vlagents_ray.evaluate.results.database import FILE
 from vlagents_ray.evaluate.results.summary import errors_of_policies, failing_cells, summarize
 from vlagents_ray.policies.base.checkpoint import STEP
 from vlagents_ray.ray_tools.private import node_of_this_process
+from vlagents_ray.registry import registered_class
 from vlagents_ray.serve.access.api_keys import load_keys
 from vlagents_ray.serve.launch.deployment_file import own_settings
 from vlagents_ray.serve.models.checkpoints import CHOICE
@@ -296,6 +297,8 @@ class Forecast:
 
 def print_plan(config: EvalConfig, address: str | None = None) -> None:
     """Print a row for each cell, and the sum. Nothing is served, played or written."""
+    for tracker in config.track:
+        registered_class("trackers", tracker)  # raises an error for an unknown name
     stated = config
     config, parts = resolve_policies(stated, ask=False)
     workers = planned_workers(stated, parts, address)

@@ -20,7 +20,7 @@ from vlagents_ray.cli.options import AsJson, Commands
 from vlagents_ray.cli.serve import serve_command
 from vlagents_ray.errors import VLAgentsError
 from vlagents_ray.naming import did_you_mean
-from vlagents_ray.registry import find_entry, load_command, names, not_installed, pip_install
+from vlagents_ray.registry import find_entry, names, not_installed, pip_install, registered_function
 
 if TYPE_CHECKING:
     from vlagents_ray.cli.listing import Listed
@@ -108,10 +108,7 @@ def doctor(
 for _command, _name, _line in (
     (results.report_command, "report", "Write the report of an evaluation again."),
     (results.export_command, "export", "Write episodes as JSON, CSV, Parquet or a LeRobotDataset."),
-    (results.merge_command, "merge", "Merge results: each episode once, by its key."),
     (results.replay_command, "replay", "Play an episode again, and compare actions."),
-    (results.bundle_command, "bundle", "Write an evaluation as one file that others can verify."),
-    (results.verify_command, "verify", "Check a bundle, and print what is equal or differs."),
 ):
     app.command(_name, short_help=_line, rich_help_panel=_MORE)(_command)
 for _commands, _name, _line in (
@@ -128,7 +125,7 @@ def _add_commands_of_plugins() -> None:
         if "." in name:  # a subcommand, which `cli.robot` runs
             continue
         try:
-            command, entry = load_command(name), find_entry("commands", name)
+            command, entry = registered_function("commands", name), find_entry("commands", name)
         except VLAgentsError as error:
             _add_failing(name, "It cannot be loaded.", str(error))
             continue

@@ -23,7 +23,7 @@ from vlagents_ray.evaluate.results.reader import Results, rate_of
 from vlagents_ray.evaluate.results.statistics import Stopping
 from vlagents_ray.evaluate.results.store import Store
 from vlagents_ray.evaluate.results.summary import Summary, summarize, write_summary
-from vlagents_ray.evaluate.trackers import TrackerFeed
+from vlagents_ray.evaluate.trackers import TrackerFeed, tracker_class
 from vlagents_ray.evaluate.workers.base import SIGNAL_S, FailedAttempts, Workers, chosen_workers, dispatch
 from vlagents_ray.evaluate.workers.in_process import workers_class
 from vlagents_ray.evaluate.workers.rollout import AgentFactory, OwnAgents, Report, agents, factory_programs
@@ -134,9 +134,12 @@ def check(config: EvalConfig) -> None:
     """Check the settings as `evaluate` does, before a policy is served for it.
 
     Raises:
-        ConfigError: An env is not registered or not installed, or the settings contradict the results in `config.out`.
+        ConfigError: An env or a tracker is not registered or not installed, or the settings contradict the results in
+            `config.out`.
     """
     require_envs(config)
+    for name in config.track:
+        tracker_class(name)
     if config.real_robot is None:  # a robot's results are written when all trials are judged
         Store(config).close()
 

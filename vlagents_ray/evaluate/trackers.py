@@ -1,36 +1,31 @@
-"""Trackers of evaluations: wandb, trackio, TensorBoard."""
+"""Shows an evaluation in trackers, such as wandb, while it runs. Plug-ins register the trackers."""
 
 from __future__ import annotations
 
-import json
 import logging
 import sqlite3
 import threading
-import time
 from collections.abc import Mapping, Sequence
 from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
 from vlagents_ray.evaluate.artifacts.storage import PROVENANCE
-from vlagents_ray.evaluate.plan.config import EvalConfig, Tracker, fingerprint
+from vlagents_ray.evaluate.plan.config import EvalConfig, fingerprint
 from vlagents_ray.evaluate.results.changes import IDENTITY
 from vlagents_ray.evaluate.results.database import FILE, WAIT_S
 from vlagents_ray.evaluate.results.reader import Results
 from vlagents_ray.evaluate.results.summary import summarize
-from vlagents_ray.naming import plain
-from vlagents_ray.registry import require
+from vlagents_ray.registry import registered_class, require_needs
 
 log = logging.getLogger(__name__)
 
-STEP = "training_step"  # wandb's axis of the curves
-FOLDER = "tensorboard"  # of its event files, in the folder of results
 CLOSE_S = 120.0  # for trackers to send what is buffered
 
 
 @dataclass(frozen=True, slots=True)
-class About:
+class TrackedPolicy:
     """The subject of a tracker's run: one policy of one folder of results, with all its checkpoints."""
 
     out: Path
@@ -42,105 +37,35 @@ class About:
     diffs: Sequence[Path]  # of the working trees from their commits
 
 
-class WandbRun:
-    """A run whose curves are drawn against `training_step`; values without a step are in its summary.
+class TrackerRun(Protocol):
+    """A run of a tracker, which plug-ins register by the entry-point group `vlagents_ray.trackers`.
 
-    The methods of a run, in any tracker, may raise anything; the caller handles it.
+    Its methods may raise any error; the caller handles it.
     """
 
-    def __init__(self, about: About) -> None:
-        self._wandb: Any = require("wandb")
-        self._id = about.id
-        # Code is in the config and in an artifact, as wandb would only read the driver's folder.
-        quiet = self._wandb.Settings(silent=True, console="off", disable_git=True, disable_code=True)
-        self._run = self._wandb.init(
-            project=about.project, group=about.group, name=about.name, id=about.id, dir=str(about.out),
-            config=about.config, job_type="eval", resume="allow", reinit="create_new", settings=quiet,
-        )  # fmt: skip
-        self._run.define_metric(STEP)
-        self._run.define_metric("*", step_metric=STEP)
-        if about.diffs:
-            self._artifact("code", "code", about.diffs)
+    def __init__(self, subject: TrackedPolicy) -> None:
+        """Begin the run, or continue the one with this id."""
 
     def log(self, metrics: Mapping[str, float], step: int | None) -> None:
         """Log values at a training step; without a step they are the only values of the run."""
-        if step is None:
-            self._run.summary.update(dict(metrics))
-        else:
-            self._run.log({STEP: step, **metrics})
 
     def videos(self, label: str, paths: Sequence[Path], step: int | None) -> None:
-        """Upload videos of episodes of the suite and env `label`, the prefix of its values' names."""
-        at = "" if step is None else f"-{step}"
-        self._artifact(f"videos-{plain(label.replace('/', '_'))}{at}", "videos", paths)
+        """Show videos of episodes of the suite and env `label`, the prefix of its values' names."""
 
     def finish(self) -> None:
         """Send the buffered values, and end the run."""
-        self._run.finish()
-
-    def _artifact(self, name: str, kind: str, paths: Sequence[Path]) -> None:
-        artifact = self._wandb.Artifact(f"{self._id}-{name}"[-128:], type=kind)
-        for path in paths:
-            artifact.add_file(str(path))
-        self._run.log_artifact(artifact)
 
 
-class TrackioRun(WandbRun):
-    """A run as in wandb, without a summary and artifacts. Its name has the id, as trackio identifies runs by name."""
+def tracker_class(name: str) -> type[TrackerRun]:
+    """Return the class of a registered tracker, or of one given as "module:Class".
 
-    def __init__(self, about: About) -> None:
-        self._trackio: Any = require("trackio")
-        self._run = self._trackio.init(
-            project=about.project, name=f"{about.name}-{about.id[:6]}", group=about.group, config=about.config,
-            resume="allow", embed=False, auto_log_gpu=False, auto_log_cpu=False,
-        )  # fmt: skip
-
-    def log(self, metrics: Mapping[str, float], step: int | None) -> None:
-        self._run.log(dict(metrics), step=step or 0)
-
-    def videos(self, label: str, paths: Sequence[Path], step: int | None) -> None:
-        shown = {f"{label}/{path.stem}": self._trackio.Video(path) for path in paths}
-        self._run.log(shown, step=step or 0)
-
-
-class TensorboardRun:
-    """Scalars and texts. TensorBoard plays no MP4, so that the paths of videos are logged."""
-
-    def __init__(self, about: About) -> None:
-        self._event: Any = require("tensorboard.compat.proto.event_pb2").Event
-        self._summary: Any = require("tensorboard.compat.proto.summary_pb2").Summary
-        self._tensor: Any = require("tensorboard.compat.proto.tensor_pb2").TensorProto
-        self._text_metadata: Any = require("tensorboard.plugins.text.metadata").create_summary_metadata
-        writer = require("tensorboard.summary.writer.event_file_writer").EventFileWriter
-        self._writer = writer(str(about.out / FOLDER / plain(about.name)))
-        self._out = about.out
-        self._text("config", json.dumps(about.config, indent=1, default=str), 0)
-
-    def log(self, metrics: Mapping[str, float], step: int | None) -> None:
-        values = [self._summary.Value(tag=name, simple_value=value) for name, value in metrics.items()]
-        self._add(values, step or 0)
-
-    def videos(self, label: str, paths: Sequence[Path], step: int | None) -> None:
-        self._text(f"{label}/videos", "\n".join(str(path.relative_to(self._out)) for path in paths), step or 0)
-
-    def finish(self) -> None:
-        self._writer.close()
-
-    def _text(self, tag: str, text: str, step: int) -> None:
-        indented = "\n".join(f"    {line}" for line in text.splitlines())  # Markdown for preformatted text
-        tensor = self._tensor(
-            dtype="DT_STRING", string_val=[indented.encode()], tensor_shape={"dim": [{"size": 1}]}
-        )  # fmt: skip
-        self._add([self._summary.Value(tag=tag, metadata=self._text_metadata(tag, ""), tensor=tensor)], step)
-
-    def _add(self, values: Sequence[Any], step: int) -> None:
-        event = self._event(step=step, wall_time=time.time(), summary=self._summary(value=values))
-        self._writer.add_event(event)
-        self._writer.flush()
-
-
-TrackerRun = WandbRun | TensorboardRun
-_RUNS: dict[str, type[TrackerRun]] = {"wandb": WandbRun, "trackio": TrackioRun, "tensorboard": TensorboardRun}
+    Raises:
+        ConfigError: There is none of this name.
+        MissingDependency: The packages that it needs are not installed.
+    """
+    cls = registered_class("trackers", name)
+    require_needs("trackers", name)
+    return cls
 
 
 class TrackerFeed:
@@ -151,11 +76,10 @@ class TrackerFeed:
     """
 
     def __init__(self, config: EvalConfig) -> None:
-        """Raise `MissingDependency` for a tracker that is not installed."""
-        for name in config.track:
-            require(name)
+        """Raise `ConfigError` for a tracker that is not registered, `MissingDependency` if its package is missing."""
+        self._classes = {name: tracker_class(name) for name in config.track}
         self._config = config
-        self._working: list[Tracker] = list(config.track)  # those that have not failed
+        self._working = list(config.track)  # those that have not failed
         self._runs: dict[tuple[str, str], TrackerRun] = {}  # by tracker and policy
         self._updated = threading.Event()
         self._closing = False
@@ -196,7 +120,7 @@ class TrackerFeed:
             except Exception as error:  # noqa: BLE001 - whatever a tracker raises
                 log.warning("%s: %s: %s", name, type(error).__name__, error)
 
-    def _log_to(self, name: Tracker, results: Results) -> None:
+    def _log_to(self, name: str, results: Results) -> None:
         with closing(sqlite3.connect(self._config.out / FILE, timeout=WAIT_S)) as db:
             logged = dict(db.execute("SELECT what, episodes FROM tracked WHERE tracker = ?", (name,)))
             summary, policies = summarize(results), results.contenders
@@ -211,7 +135,7 @@ class TrackerFeed:
                     continue
                 policy = cells[0].policy
                 if (run := self._runs.get((name, policy))) is None:
-                    run = self._runs[name, policy] = _RUNS[name](self._about(results, policy))
+                    run = self._runs[name, policy] = self._classes[name](self._subject(results, policy))
                 rates = {"success_once": group.success_once.rate, "success_at_end": group.success_at_end.rate}
                 values = rates | {"return": group.mean_return, "steps": group.mean_steps, "episodes": group.episodes}
                 label = "/".join(filter(None, (group.suite, group.env)))
@@ -223,14 +147,14 @@ class TrackerFeed:
                 with db:
                     db.execute("INSERT OR REPLACE INTO tracked VALUES (?, ?, ?)", (name, part, group.episodes))
 
-    def _about(self, results: Results, policy: str) -> About:
+    def _subject(self, results: Results, policy: str) -> TrackedPolicy:
         out, names = self._config.out, self._config.tracking
         metadata = results.policies.get(policy, {})
         served = {name: metadata.get(name) for name in IDENTITY}
         code: dict[str, Any] = dict(results.runs[-1].versions.get("code", {}))
         code[f"policy {policy}"] = metadata.get("code")
         code |= {f"env {cell.env}": cell.code for cell in results.cells}
-        return About(
+        return TrackedPolicy(
             out, names.project, names.group or out.resolve().name, policy,
             fingerprint([results.runs[0].started, policy]),
             {"evaluation": results.runs[-1].config, "served": served, "code": code},

@@ -19,7 +19,6 @@ from rich.console import Console
 from vlagents_ray.errors import ConfigError
 from vlagents_ray.evaluate import Results, print_summary
 from vlagents_ray.evaluate.episode.records import EpisodeResult
-from vlagents_ray.evaluate.merge import merge
 from vlagents_ray.evaluate.plan.cases import EvalCase
 from vlagents_ray.evaluate.plan.jobs import EpisodeKey
 from vlagents_ray.evaluate.report import success
@@ -30,6 +29,7 @@ from vlagents_ray.evaluate.results.comparison import compare
 from vlagents_ray.evaluate.results.reader import CellResults, Episode, Run
 from vlagents_ray.evaluate.results.statistics import ERROR_RATE
 from vlagents_ray.evaluate.results.summary import Summary, summarize
+from vlagents_ray_results.merge import merge
 
 EPISODES = 60
 EVALUATIONS = 200

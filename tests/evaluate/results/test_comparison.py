@@ -10,8 +10,8 @@ from recorded_results import record, runs
 
 from vlagents_ray.errors import ConfigError
 from vlagents_ray.evaluate import Results
-from vlagents_ray.evaluate.merge import combined
 from vlagents_ray.evaluate.report.page import configuration
+from vlagents_ray.evaluate.results.combination import combined
 from vlagents_ray.evaluate.results.comparison import clock_gaps, comparable, compare, comparisons
 from vlagents_ray.evaluate.results.statistics import Pairs
 

@@ -18,11 +18,11 @@ from faulty_disks import READ_ONLY, python_on
 from vlagents_ray.errors import ConfigError
 from vlagents_ray.evaluate import EvalConfig, Results
 from vlagents_ray.evaluate.episode.records import EpisodeResult
-from vlagents_ray.evaluate.merge import merge
 from vlagents_ray.evaluate.plan.cases import cells
 from vlagents_ray.evaluate.plan.jobs import plan
 from vlagents_ray.evaluate.results import database
 from vlagents_ray.evaluate.results.store import Store
+from vlagents_ray_results.merge import merge
 
 Config = Callable[..., EvalConfig]
 COUNT = """

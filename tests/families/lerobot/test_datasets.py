@@ -16,9 +16,9 @@ from recorded_sessions import recorded, seen
 
 from vlagents_ray.dataset_contract import BYTES, STATISTICS, DatasetContract
 from vlagents_ray.evaluate.artifacts.recorder import Trajectory
-from vlagents_ray.evaluate.exports import to_lerobot
 from vlagents_ray.interface import Obs
 from vlagents_ray.robot.record import Recorder
+from vlagents_ray_results.lerobot import to_lerobot
 
 
 def test_lerobot_reads_what_an_evaluation_recorded(tmp_path: Path) -> None:

@@ -29,12 +29,12 @@ from vlagents_ray.cli.options import parse_settings
 from vlagents_ray.contract import Contract, StateSpec, require_match
 from vlagents_ray.dataset_contract import BYTES, STATISTICS, DatasetContract
 from vlagents_ray.envs import make_env
-from vlagents_ray.evaluate.exports import to_lerobot
 from vlagents_ray.interface import Act, Obs
 from vlagents_ray.policies.lerobot import LeRobot
 from vlagents_ray.policies.scripted import Scripted
 from vlagents_ray.robot.record import Recorder
 from vlagents_ray.serve.models.agent_copies import AgentCopies
+from vlagents_ray_results.lerobot import to_lerobot
 
 STEPS = 10
 IMAGES, STATE_ALONE = 0, 1  # in the order of the page

@@ -7,7 +7,6 @@ import os
 import platform
 import shutil
 import sqlite3
-import tempfile
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from glob import escape
@@ -97,6 +96,16 @@ def outcome(result: EpisodeResult) -> str:
     return "success" if result.success_once else "failure"
 
 
+def require_folder_of(file: Path) -> None:
+    """Raise `ConfigError` unless this file can be written: its folder exists, and it is not a folder itself."""
+    if file.is_dir():
+        raise ConfigError(f"{file}: expected a file, got a folder; add the name of a file")
+    if not file.absolute().parent.is_dir():
+        raise ConfigError(
+            f"{file}: expected a file in a folder that exists, got no folder {file.parent}; make it first"
+        )
+
+
 @contextmanager
 def whole(path: Path) -> Iterator[Path]:
     """Yield a path for writing, which is renamed to `path` when the file is complete; make missing folders.
@@ -112,22 +121,6 @@ def whole(path: Path) -> Iterator[Path]:
     except BaseException:
         part.unlink(missing_ok=True)
         raise
-
-
-@contextmanager
-def whole_folder(path: Path) -> Iterator[Path]:
-    """Yield a folder for writing, which becomes `path`, missing or empty so far, when it is complete.
-
-    It is beside `path` until then, and removed if writing fails.
-    """
-    path = path.resolve()
-    path.parent.mkdir(parents=True, exist_ok=True)
-    with tempfile.TemporaryDirectory(prefix=f"{path.name}.part-", dir=path.parent) as temporary:
-        part = Path(temporary) / path.name
-        part.mkdir()
-        yield part
-        os.sync()  # one for all its files
-        os.replace(part, path)
 
 
 def link_or_copy(source: Path, target: Path) -> None:

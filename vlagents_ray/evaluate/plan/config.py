@@ -34,7 +34,6 @@ from vlagents_ray.client.transports.select import TransportName
 from vlagents_ray.ray_tools.runtime_env import require_no_secrets
 
 EpisodeChoice = Literal["none", "failures", "all"]
-Tracker = Literal["wandb", "trackio", "tensorboard"]
 Name = Annotated[str, Field(min_length=1)]
 Count = Annotated[int, Field(ge=1, le=MOST_EPISODES)]
 Retries = Annotated[int, Field(ge=0, le=MOST_RETRIES)]
@@ -252,7 +251,7 @@ class EvalConfig(_PlanModel):
     accept_changes: bool = False  # resume although files of policy or environment changed; the report shows it
     worker: WorkerConfig = WorkerConfig()
     stop: StopConfig | None = None  # early stopping; None: every episode is played
-    track: list[Tracker] = []  # trackers that show rates and videos beside `out`, against the training step
+    track: list[Name] = []  # trackers that show rates and videos beside `out`, against the training step
     tracking: TrackingConfig = TrackingConfig()
     robot: RobotConfig | None = None  # a real robot and its tasks
 

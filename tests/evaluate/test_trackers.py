@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import ClassVar
@@ -11,9 +10,11 @@ import pytest
 from eval_fakes import LINE, OTHER_LINE, ToZero
 from in_process_evaluation import play
 
-from vlagents_ray.errors import MissingDependency
-from vlagents_ray.evaluate import EvalConfig, evaluate, trackers
-from vlagents_ray.evaluate.trackers import About, TrackerFeed
+from vlagents_ray import registry
+from vlagents_ray.errors import ConfigError, MissingDependency
+from vlagents_ray.evaluate import EvalConfig, check, evaluate
+from vlagents_ray.evaluate.trackers import TrackedPolicy, TrackerFeed
+from vlagents_ray.registry import RegistryEntry
 
 Config = Callable[..., EvalConfig]
 
@@ -21,12 +22,12 @@ Config = Callable[..., EvalConfig]
 class Listener:
     """Keeps what it is told."""
 
-    begun: ClassVar[list[About]] = []
+    begun: ClassVar[list[TrackedPolicy]] = []
     told: ClassVar[list[tuple[str, int | None, dict[str, float]]]] = []
     shown: ClassVar[list[tuple[str, list[str]]]] = []
     finished: ClassVar[list[str]] = []
 
-    def __init__(self, about: About) -> None:
+    def __init__(self, about: TrackedPolicy) -> None:
         self.about = about
         self.begun.append(about)
 
@@ -48,9 +49,12 @@ class Broken(Listener):
 
 @pytest.fixture(autouse=True)
 def listening(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(trackers, "require", lambda _name: None)
-    runs = {"wandb": Listener, "tensorboard": Broken}
-    monkeypatch.setattr(trackers, "_RUNS", runs)
+    classes = {"listener": Listener, "broken": Broken}
+    entries = {name: RegistryEntry(f"{__name__}:{cls.__name__}") for name, cls in classes.items()}
+    entries["lacking"] = RegistryEntry(
+        f"{__name__}:Listener", needs=("no_such_tracker",), extra="lacking", distribution="lab-trackers"
+    )
+    monkeypatch.setitem(registry._BUILT_IN, "trackers", entries)
     for kept in (Listener.begun, Listener.told, Listener.shown, Listener.finished):
         kept.clear()
 
@@ -64,7 +68,7 @@ def tell(config: EvalConfig) -> list[tuple[str, int | None, dict[str, float]]]:
 
 
 def test_rates_return_and_steps_of_each_task_and_in_total_stand_at_the_training_step(config: Config) -> None:
-    settings = config(envs=[LINE, OTHER_LINE], episodes=4, steps=[10, 20], track=["wandb"])
+    settings = config(envs=[LINE, OTHER_LINE], episodes=4, steps=[10, 20], track=["listener"])
     results = play(settings)
     told = tell(settings)
     assert [(step, min(metrics).rpartition("/")[0]) for _, step, metrics in told] == [
@@ -83,7 +87,7 @@ def test_rates_return_and_steps_of_each_task_and_in_total_stand_at_the_training_
 
 
 def test_an_unfinished_cell_is_told_by_the_run_that_completes_it_and_no_other_twice(config: Config) -> None:
-    settings = config(envs=[LINE, OTHER_LINE], episodes=3, track=["wandb"])
+    settings = config(envs=[LINE, OTHER_LINE], episodes=3, track=["listener"])
     one_env = {"suites": [settings.suites[0].model_copy(update={"envs": [LINE]})]}
     play(settings, left_out=[2])
     assert tell(settings) == []
@@ -97,7 +101,7 @@ def test_an_unfinished_cell_is_told_by_the_run_that_completes_it_and_no_other_tw
 
 
 def test_the_weights_of_the_server_are_in_the_settings_of_the_run(config: Config) -> None:
-    settings = config(episodes=1, track=["wandb"])
+    settings = config(episodes=1, track=["listener"])
     said = {"policy": "act", "checkpoint": "runs/last", "weights": {"digest": "x", "revision": None}}
 
     class Served(ToZero):
@@ -109,7 +113,7 @@ def test_the_weights_of_the_server_are_in_the_settings_of_the_run(config: Config
 
 
 def test_a_cell_that_stopped_early_is_complete(config: Config) -> None:
-    settings = config(episodes=40, stop={"target": 0.3}, track=["wandb"])
+    settings = config(episodes=40, stop={"target": 0.3}, track=["listener"])
     [cell] = play(settings, left_out=range(30, 40)).cells
     assert cell.stopped_at is not None
     assert [metrics[min(metrics)] for _, _, metrics in tell(settings)] == [cell.stopped_at] * 2
@@ -117,7 +121,7 @@ def test_a_cell_that_stopped_early_is_complete(config: Config) -> None:
 
 def test_of_the_videos_a_few_are_shown_failures_first(config: Config) -> None:
     settings = config(
-        episodes=12, video="all", env_options={"camera": [32, 32]}, track=["wandb"], tracking={"videos": 3}
+        episodes=12, video="all", env_options={"camera": [32, 32]}, track=["listener"], tracking={"videos": 3}
     )
     play(settings)
     tell(settings)
@@ -129,15 +133,15 @@ def test_of_the_videos_a_few_are_shown_failures_first(config: Config) -> None:
 def test_a_tracker_that_fails_is_a_warning_and_the_others_go_on(
     config: Config, caplog: pytest.LogCaptureFixture
 ) -> None:
-    settings = config(episodes=2, steps=[1], track=["tensorboard", "wandb"])
+    settings = config(episodes=2, steps=[1], track=["broken", "listener"])
     play(settings)
     assert len(tell(settings)) == 2
     [record] = caplog.records
-    assert record.getMessage() == "tensorboard: RuntimeError: no such project; nothing more is logged to it"
+    assert record.getMessage() == "broken: RuntimeError: no such project; nothing more is logged to it"
 
 
 def test_an_evaluation_tells_while_it_runs_and_at_its_end(config: Config) -> None:
-    settings = config(envs=[LINE, OTHER_LINE], episodes=2, track=["wandb"], workers=0)
+    settings = config(envs=[LINE, OTHER_LINE], episodes=2, track=["listener"], workers=0)
     summary = evaluate(settings, agent_factory=ToZero)
     assert summary.state == "complete"
     assert sorted(min(metrics) for _, _, metrics in Listener.told) == [
@@ -147,8 +151,13 @@ def test_an_evaluation_tells_while_it_runs_and_at_its_end(config: Config) -> Non
     assert {"code", "evaluation", "served"} == Listener.begun[0].config.keys()
 
 
-def test_a_missing_package_is_said_before_anything_starts(config: Config, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.undo()
-    monkeypatch.setitem(sys.modules, "wandb", None)
-    with pytest.raises(MissingDependency, match=r"pip install 'vlagents-ray\[wandb\]'"):
-        TrackerFeed(config(track=["wandb"]))
+def test_a_missing_package_is_an_error_before_anything_starts(config: Config) -> None:
+    for use in (TrackerFeed, check):
+        with pytest.raises(MissingDependency, match=r"pip install 'lab-trackers\[lacking\]'"):
+            use(config(track=["lacking"]))
+
+
+def test_an_unknown_tracker_is_an_error_with_the_registered_ones_before_anything_starts(config: Config) -> None:
+    for use in (TrackerFeed, check):
+        with pytest.raises(ConfigError, match=r"'listner' is not registered: want one of .*did you mean 'listener'"):
+            use(config(track=["listner"]))

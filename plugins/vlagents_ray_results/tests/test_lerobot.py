@@ -26,8 +26,8 @@ from vlagents_ray.datasets.writer import Dataset
 from vlagents_ray.errors import ConfigError
 from vlagents_ray.evaluate import EvalConfig, Results
 from vlagents_ray.evaluate.artifacts.recorder import Trajectory
-from vlagents_ray.evaluate.exports import to_lerobot
 from vlagents_ray.interface import Act, Obs
+from vlagents_ray_results.lerobot import to_lerobot
 
 Config = Callable[..., EvalConfig]
 CAMERA = {"camera": [32, 48]}

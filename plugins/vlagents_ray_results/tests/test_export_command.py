@@ -13,8 +13,11 @@ from wrist_roll_env import ROLLER, Turner
 from vlagents_ray.cli.main import app
 
 
-def export(*words: object) -> Result:
-    return CliRunner().invoke(app, ["export", *map(str, words)], env={"COLUMNS": "200"})
+def to_lerobot(folder: Path, out: Path, *settings: str) -> Result:
+    words = ["export", str(folder), "--out", str(out), "--to", "lerobot"]
+    for setting in settings:
+        words += ["--set", setting]
+    return CliRunner().invoke(app, words, env={"COLUMNS": "200"})
 
 
 @pytest.fixture(scope="module")
@@ -25,8 +28,8 @@ def played(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_cameras_parts_successes_and_ends_of_a_dataset_are_chosen(played: Path, tmp_path: Path) -> None:
-    chosen = ["--cameras", "wrist", "--state", "joints, gripper", "--successes", "--cut-idle"]
-    done = export(played, "--out", tmp_path / "d", "--to", "lerobot", *chosen)
+    chosen = ["cameras=[wrist]", "state=[joints, gripper]", "successes=true", "cut_idle=true"]
+    done = to_lerobot(played, tmp_path / "d", *chosen)
     assert done.exit_code == 0, done.output
     assert done.output.startswith("wrote 1 episodes")
     info = json.loads((tmp_path / "d/meta/info.json").read_text())
@@ -36,15 +39,27 @@ def test_cameras_parts_successes_and_ends_of_a_dataset_are_chosen(played: Path, 
 
 
 def test_a_dataset_without_cameras_has_a_state_of_the_environment(played: Path, tmp_path: Path) -> None:
-    done = export(played, "--out", tmp_path / "d", "--to", "lerobot", "--cameras", "", "--environment-state", "joints")
+    done = to_lerobot(played, tmp_path / "d", "cameras=[]", "environment_state=[joints]")
     assert done.exit_code == 0, done.output
     features = json.loads((tmp_path / "d/meta/info.json").read_text())["features"]
     assert features["observation.environment_state"]["names"] == ["joints_0", "joints_1"]
     assert not (tmp_path / "d/videos").exists()
 
 
-def test_a_table_has_no_frames_to_choose(played: Path, tmp_path: Path) -> None:
-    done = export(played, "--out", tmp_path / "t.csv", "--to", "csv", "--cut-idle", "--state", "joints")
+@pytest.mark.parametrize(
+    ("setting", "message"),
+    [
+        ("cameras=wrist", "such as [wrist]"),
+        ("successes=often", "'often'"),
+        ("succeses=true", "did you mean 'successes'"),
+        ("results=x", "there is no such setting"),
+        ("cameras=[front]", "has no 'front', want some of"),
+    ],
+)
+def test_a_setting_that_a_dataset_does_not_have_is_refused(
+    played: Path, tmp_path: Path, setting: str, message: str
+) -> None:
+    done = to_lerobot(played, tmp_path / "d", setting)
     assert done.exit_code == 2
-    assert "--state, --cut-idle: got --to csv, want --to lerobot" in " ".join(done.output.split())
-    assert not (tmp_path / "t.csv").exists()
+    assert message in " ".join(done.output.split())
+    assert not (tmp_path / "d").exists()

@@ -1,9 +1,6 @@
-"""An evaluation in one file, which others can cite, check, replay in part, and merge with their own.
+"""Checks of a bundle: its digests, its database, its recordings, and a replay of some episodes.
 
-The file is a ZIP archive whose first member lists the others with their digests. An archive may come from a stranger.
-Its list of members is checked before any is read: `pack` could have written every name, so that none leads out of the
-folder; no member is a link; the sizes are bounded, and no member yields more bytes than it states. Nothing is unpickled
-or imported. A replay plays recorded actions in their environment, and compares; no policy is needed.
+A replay runs recorded actions in their environment, and compares; no policy is needed.
 """
 
 from __future__ import annotations
@@ -15,21 +12,16 @@ import os
 import random
 import re
 import secrets
-import shutil
 import sqlite3
-import stat
 import tempfile
 import zipfile
-import zlib
 from collections.abc import Iterator, Mapping
-from contextlib import closing
 from dataclasses import dataclass
 from itertools import islice, zip_longest
 from pathlib import Path
-from typing import IO, Any, Literal, get_args
+from typing import Any, Literal, get_args
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from vlagents_ray.envs.base import make_batch
 from vlagents_ray.errors import ConfigError, VLAgentsError
@@ -39,7 +31,7 @@ from vlagents_ray.evaluate.episode.episode import options_of_reset
 from vlagents_ray.evaluate.episode.failures import EnvStep, env_side
 from vlagents_ray.evaluate.episode.records import Ending, Status
 from vlagents_ray.evaluate.episode.second_pass import play_actions
-from vlagents_ray.evaluate.plan.config import canonical, fingerprint
+from vlagents_ray.evaluate.plan.config import fingerprint
 from vlagents_ray.evaluate.report.page import FILE as REPORT
 from vlagents_ray.evaluate.report.page import write_report
 from vlagents_ray.evaluate.results.database import FILE as DATABASE
@@ -47,222 +39,7 @@ from vlagents_ray.evaluate.results.reader import CellResults, Episode, Results, 
 from vlagents_ray.evaluate.results.summary import summarize, write_summary
 from vlagents_ray.interface import Obs
 from vlagents_ray.registry import env_suite, names
-
-__all__ = ["Finding", "Verification", "verify", "write_bundle"]
-
-MANIFEST = "bundle.json"
-MOST_BYTES = 16 * 10**9  # of all members, unpacked
-_MOST_MEMBERS = 200_000
-_MOST_MANIFEST = 64 * 2**20  # bytes
-_CHUNK = 2**20
-_PART = r"[\w@-][\w.@-]{0,200}"  # of a path, as `naming.plain` leaves names: it neither is nor begins with a dot
-_KNOWN = re.compile(
-    rf"{re.escape(MANIFEST)}|{re.escape(DATABASE)}|{storage.PROVENANCE}/[0-9a-f]{{64}}\.diff"
-    rf"|{storage.TRAJECTORIES}/({_PART}/){{1,3}}{_PART}\.(npz|mp4)|{storage.VIDEOS}/({_PART}/){{1,3}}{_PART}\.mp4"
-)
-_BROKEN = (zipfile.BadZipFile, zlib.error, EOFError, NotImplementedError, RuntimeError, ValueError)
-_DISTRUST = "no `vlagents-ray bundle` writes that: do not trust the author of this bundle"
-
-
-class FileDigest(BaseModel):
-    """A file of a bundle."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
-
-    sha256: str = Field(pattern="^[0-9a-f]{64}$")
-    size: int = Field(ge=0)  # bytes
-
-
-class Manifest(BaseModel):
-    """The content of `bundle.json`."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
-
-    format: Literal["vlagents-ray bundle"] = "vlagents-ray bundle"
-    version: Literal[1] = 1
-    files: dict[str, FileDigest]  # all others, by their paths
-
-
-def digest_of(path: Path) -> FileDigest:
-    sha256, size = hashlib.sha256(), 0
-    with path.open("rb") as file:
-        while chunk := file.read(_CHUNK):
-            sha256.update(chunk)
-            size += len(chunk)
-    return FileDigest(sha256=sha256.hexdigest(), size=size)
-
-
-def pack(folder: Path, archive: Path) -> str:
-    """Write all files of `folder` into the bundle `archive`, whole or not at all; the same files give the same bytes.
-
-    Returns:
-        The SHA-256 of the manifest, which identifies the content of the bundle.
-    """
-    paths = sorted(path for path in folder.rglob("*") if path.is_file())
-    names = {path.relative_to(folder).as_posix(): path for path in paths}
-    if odd := [name for name in names if not _KNOWN.fullmatch(name) or name == MANIFEST]:
-        raise ConfigError(f"{folder}: got the files {odd[:5]}, which a bundle may not hold; rename or remove them")
-    manifest = Manifest(files={name: digest_of(path) for name, path in names.items()})
-    text = (manifest.model_dump_json(indent=1) + "\n").encode()
-    with storage.whole(archive) as part, zipfile.ZipFile(part, "w", zipfile.ZIP_DEFLATED) as file:
-        file.writestr(_member(MANIFEST), text, zipfile.ZIP_DEFLATED)
-        for name, path in names.items():
-            how = zipfile.ZIP_STORED if path.suffix in (".mp4", ".npz") else zipfile.ZIP_DEFLATED  # already compressed
-            with path.open("rb") as source, file.open(_member(name, how), "w", force_zip64=True) as target:
-                shutil.copyfileobj(source, target, _CHUNK)
-    return hashlib.sha256(text).hexdigest()
-
-
-def _member(name: str, how: int = zipfile.ZIP_DEFLATED) -> zipfile.ZipInfo:
-    member = zipfile.ZipInfo(name)  # of 1980: the time is not part of the results
-    member.compress_type, member.external_attr = how, (stat.S_IFREG | 0o644) << 16
-    return member
-
-
-def _require_file(archive: Path) -> None:
-    if (archive / DATABASE).is_file():
-        raise ConfigError(
-            f"{archive}: expected a bundle, got a folder of results; `vlagents-ray bundle {archive}` writes its bundle"
-        )
-    if not archive.is_file():
-        what = "a folder" if archive.is_dir() else "no file"
-        raise ConfigError(f"{archive}: expected a bundle, a file that `vlagents-ray bundle` wrote, got {what}")
-
-
-def unpack(archive: Path, folder: Path, *, most_bytes: int = MOST_BYTES) -> tuple[Manifest, str, list[str]]:
-    """Write the files of a bundle into `folder`, without its manifest.
-
-    Returns:
-        The manifest, its SHA-256, and the differences between the manifest and the files, a sentence each.
-
-    Raises:
-        ConfigError: The file is no bundle, or is larger than allowed, or has a name that leads out of `folder`.
-    """
-    _require_file(archive)
-    try:
-        with zipfile.ZipFile(archive) as file:
-            members = _checked(archive, file, most_bytes)
-            manifest, sha256 = _manifest(archive, file, members.pop(MANIFEST, None))
-            found: dict[str, FileDigest] = {}
-            for name, member in members.items():
-                target = folder / name
-                target.parent.mkdir(parents=True, exist_ok=True)
-                with file.open(member) as source, target.open("xb") as written:
-                    found[name] = _copy(archive, source, written, member)
-    except ConfigError:
-        raise
-    except _BROKEN as error:
-        raise ConfigError(f"{archive}: cannot be read as a bundle ({error}); copy it again from its source") from error
-    stated = manifest.files
-    odd = [f"{name} is not in the bundle" for name in stated.keys() - found.keys()]
-    odd += [f"{name} is not in the manifest" for name in found.keys() - stated.keys()]
-    odd += [f"{name} has another digest" for name in stated.keys() & found.keys() if stated[name] != found[name]]
-    return manifest, sha256, sorted(odd)
-
-
-def _checked(archive: Path, file: zipfile.ZipFile, most_bytes: int) -> dict[str, zipfile.ZipInfo]:
-    """Return the members by their names, after all checks that need not read them."""
-    listed = file.infolist()
-    if len(listed) > _MOST_MEMBERS:
-        raise ConfigError(f"{archive}: got {len(listed)} files, want at most {_MOST_MEMBERS}; {_DISTRUST}")
-    members: dict[str, zipfile.ZipInfo] = {}
-    for member in listed:
-        name = member.orig_filename
-        kind = stat.S_IFMT(member.external_attr >> 16)
-        if not _KNOWN.fullmatch(name) or member.filename != name:
-            raise ConfigError(f"{archive}: got the file {name!r}, want those of a folder of results; {_DISTRUST}")
-        if name in members:
-            raise ConfigError(f"{archive}: got {name!r} twice; {_DISTRUST}")
-        if kind not in (0, stat.S_IFREG):
-            raise ConfigError(f"{archive}: {name!r} is a link or another special file; {_DISTRUST}")
-        if member.flag_bits & 0x1 or member.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
-            raise ConfigError(f"{archive}: {name!r} is encrypted, or packed in another way than a bundle; {_DISTRUST}")
-        members[name] = member
-    if (total := sum(member.file_size for member in listed)) > most_bytes:
-        raise ConfigError(
-            f"{archive}: unpacks to {total} bytes, want at most {most_bytes}; allow more with --max-gb if you trust it"
-        )
-    return members
-
-
-def _manifest(archive: Path, file: zipfile.ZipFile, member: zipfile.ZipInfo | None) -> tuple[Manifest, str]:
-    if member is None:
-        raise ConfigError(f"{archive}: has no {MANIFEST}, want a bundle that `vlagents-ray bundle` wrote")
-    if member.file_size > _MOST_MANIFEST:
-        raise ConfigError(f"{archive}: {MANIFEST} has {member.file_size} bytes, want at most {_MOST_MANIFEST}")
-    with file.open(member) as opened:
-        text = opened.read(_MOST_MANIFEST + 1)
-    try:
-        return Manifest.model_validate_json(text), hashlib.sha256(text).hexdigest()
-    except ValidationError as error:
-        first = error.errors(include_url=False, include_input=False)[0]
-        where = ".".join(map(str, first["loc"]))
-        raise ConfigError(
-            f"{archive}: {MANIFEST} is not one of version 1: {where}: {first['msg']}; read it with the version of "
-            f"vlagents-ray that wrote it"
-        ) from error
-
-
-def _copy(archive: Path, source: IO[bytes], target: IO[bytes], member: zipfile.ZipInfo) -> FileDigest:
-    sha256, size = hashlib.sha256(), 0
-    while chunk := source.read(_CHUNK):
-        size += len(chunk)
-        if size > member.file_size:
-            raise ConfigError(f"{archive}: {member.filename!r} has more bytes than it states; {_DISTRUST}")
-        sha256.update(chunk)
-        target.write(chunk)
-    return FileDigest(sha256=sha256.hexdigest(), size=size)
-
-
-def write_bundle(folder: Path, archive: Path, *, videos: bool = False) -> str:
-    """Write the results in `folder` as one file that others can check (`verify`).
-
-    It holds the present results.db, the differences from the commits, and the trajectories, by which episodes are
-    played again, but nothing that is computed from these. The database names only files in the bundle, so that its
-    results can be merged with others.
-
-    Args:
-        folder: A folder of results, to which an evaluation may be writing; nothing in it is changed.
-        videos: Whether the bundle also holds the videos: those of the report, and of the policy's images.
-
-    Returns:
-        The SHA-256 of its manifest, which identifies its content.
-
-    Raises:
-        ConfigError: The folder has no results, or one of its files is outside of it.
-        StorageFailed: The disk is full, or cannot be written to.
-    """
-    with storage.storing(archive.parent):
-        archive.parent.mkdir(parents=True, exist_ok=True)
-        with tempfile.TemporaryDirectory(prefix=f"{archive.name}.part-", dir=archive.parent) as temporary:
-            stage = Path(temporary)
-            # One consistent state, even while an evaluation writes to it.
-            with reading(folder) as source, closing(sqlite3.connect(stage / DATABASE)) as target:
-                source.backup(target)
-            _link_files(folder, stage, Results.load(stage), videos=videos)
-            # Remove the names of files that are not in the bundle.
-            with closing(sqlite3.connect(stage / DATABASE)) as db, db:
-                for key, shown, numbers in db.execute("SELECT key, videos, trajectory FROM episodes").fetchall():
-                    there = [path for path in json.loads(shown) if (stage / path).is_file()]
-                    values = canonical(there), numbers if numbers and (stage / numbers).is_file() else None, key
-                    db.execute("UPDATE episodes SET videos = ?, trajectory = ? WHERE key = ?", values)
-            return pack(stage, archive)
-
-
-def _link_files(folder: Path, stage: Path, results: Results, *, videos: bool) -> None:
-    paths: list[str] = []
-    for cell in results.cells:
-        for one in cell.episodes:
-            if videos:
-                paths += one.videos
-            if one.trajectory is not None:
-                paths += [one.trajectory, *(storage.trajectory_videos(folder, one.trajectory) if videos else ())]
-    paths += [f"{storage.PROVENANCE}/{path.name}" for path in sorted((folder / storage.PROVENANCE).glob("*.diff"))]
-    for path in dict.fromkeys(paths):
-        source = storage.inside(folder, path)
-        if source.is_file():  # a folder that was copied without its videos can be bundled
-            storage.link_or_copy(source, stage / path)
-
+from vlagents_ray_results.bundle import MANIFEST, MOST_BYTES, require_file, unpack
 
 Verdict = Literal["equal", "differs", "other here", "not checked"]
 MOST_TRAJECTORY = 2**30  # bytes of one, unpacked
@@ -330,7 +107,7 @@ def verify(
     """
     if into is not None and into.exists():
         raise ConfigError(f"{into}: is there already; want a new folder")
-    _require_file(bundle)
+    require_file(bundle)
     if seed is None:
         seed = secrets.randbits(32)
     parent = None if into is None else into.absolute().parent

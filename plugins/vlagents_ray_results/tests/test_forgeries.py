@@ -18,9 +18,10 @@ from in_process_evaluation import flat_config, play
 
 from vlagents_ray.errors import ConfigError
 from vlagents_ray.evaluate.artifacts.recorder import Trajectory
-from vlagents_ray.evaluate.bundle import Verification, pack, unpack, verify, write_bundle
 from vlagents_ray.evaluate.results.database import SCHEMA
 from vlagents_ray.interface import Act, Obs
+from vlagents_ray_results.bundle import pack, unpack, write_bundle
+from vlagents_ray_results.verification import Verification, verify
 
 Forge = Callable[..., Verification]
 EPISODES = 6

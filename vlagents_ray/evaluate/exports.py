@@ -1,4 +1,4 @@
-"""A table with one row for each episode, as JSON, CSV or Parquet.
+"""A table with one row for each episode, as JSON or CSV.
 
 The names and types of the columns stay as they are; new columns come last.
 """
@@ -13,10 +13,9 @@ from datetime import datetime, timezone
 from pathlib import Path
 from typing import Any, Literal
 
-from vlagents_ray.evaluate.artifacts.storage import whole
+from vlagents_ray.evaluate.artifacts.storage import require_folder_of, whole
 from vlagents_ray.evaluate.plan.config import canonical
 from vlagents_ray.evaluate.results.reader import CellResults, Episode, Results
-from vlagents_ray.registry import require
 
 Type = Literal["string", "integer", "number", "boolean", "time", "json"]
 
@@ -109,6 +108,7 @@ _JSON = {column.name for column in COLUMNS if column.type == "json"}
 
 def to_json(results: Results, path: Path) -> int:
     """Write a list with one object for each episode; times are ISO 8601, in UTC. Returns the number of episodes."""
+    require_folder_of(path)
     found = list(rows(results))
     with whole(path) as part:
         part.write_text(json.dumps(found, indent=1, default=_text, ensure_ascii=False) + "\n", encoding="utf-8")
@@ -120,6 +120,7 @@ def to_csv(results: Results, path: Path) -> int:
 
     Returns the number of episodes.
     """
+    require_folder_of(path)
     number = 0
     with whole(path) as part, part.open("w", encoding="utf-8", newline="") as file:
         writer = csv.DictWriter(file, [column.name for column in COLUMNS])
@@ -128,20 +129,6 @@ def to_csv(results: Results, path: Path) -> int:
             row |= {name: str(value).lower() for name, value in row.items() if isinstance(value, bool)}
             writer.writerow({name: _text(one) if isinstance(one, datetime) else one for name, one in row.items()})
     return number
-
-
-def to_parquet(results: Results, path: Path) -> int:
-    """Write a typed table; nested values are JSON text. Needs the extra "record". Returns the number of episodes."""
-    pa: Any = require("pyarrow")
-    types = {
-        "string": pa.string(), "integer": pa.int64(), "number": pa.float64(), "boolean": pa.bool_(),
-        "time": pa.timestamp("us", "UTC"), "json": pa.string(),
-    }  # fmt: skip
-    fields = [pa.field(one.name, types[one.type], metadata={"meaning": one.meaning}) for one in COLUMNS]
-    found = list(rows(results, flat=True))
-    with whole(path) as part:
-        require("pyarrow.parquet").write_table(pa.Table.from_pylist(found, pa.schema(fields)), part)
-    return len(found)
 
 
 def _text(value: object) -> str:

@@ -22,10 +22,11 @@ from vlagents_ray.cli.main import app
 from vlagents_ray.errors import ConfigError
 from vlagents_ray.evaluate import Results
 from vlagents_ray.evaluate.artifacts.recorder import Trajectory
-from vlagents_ray.evaluate.bundle import Verification, verify, write_bundle
-from vlagents_ray.evaluate.merge import merge
 from vlagents_ray.evaluate.results.summary import summarize
 from vlagents_ray.interface import Act, Agent, Obs
+from vlagents_ray_results.bundle import write_bundle
+from vlagents_ray_results.merge import merge
+from vlagents_ray_results.verification import Verification, verify
 
 Change = Callable[[Path], None]
 

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import os
 import shutil
+import tempfile
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from itertools import islice
 from pathlib import Path
@@ -42,7 +45,7 @@ from vlagents_ray.datasets.episode import (
 from vlagents_ray.datasets.writer import UNFINISHED, Dataset
 from vlagents_ray.errors import ConfigError
 from vlagents_ray.evaluate.artifacts.recorder import DEFAULT_FPS, Trajectory, videos_of
-from vlagents_ray.evaluate.artifacts.storage import link_or_copy, require_there, whole_folder
+from vlagents_ray.evaluate.artifacts.storage import link_or_copy, require_there
 from vlagents_ray.evaluate.results.reader import CellResults, Episode, Results
 from vlagents_ray.images.mp4 import rgb_converter
 from vlagents_ray.naming import did_you_mean, distinct
@@ -138,7 +141,7 @@ def to_lerobot(
                 yield one
 
     angles = _angles(demonstrations())
-    with whole_folder(path) as root:
+    with _new_folder(path) as root:
         dataset = Dataset(root, rates.pop(), durable=False)
         for one in demonstrations():
             finished = _finished(one, angles, root / UNFINISHED)
@@ -173,6 +176,22 @@ class _Demonstration:
     gripper: np.ndarray | None  # (N,)
     versions: np.ndarray | None  # (N,) of the weights that chose each action; None if no episode's policy named them
     videos: dict[str, Path]  # by camera
+
+
+@contextmanager
+def _new_folder(path: Path) -> Iterator[Path]:
+    """Yield a folder for writing, which becomes `path`, missing or empty so far, when it is complete.
+
+    It is beside `path` until then, and removed if writing fails.
+    """
+    path = path.resolve()
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with tempfile.TemporaryDirectory(prefix=f"{path.name}.part-", dir=path.parent) as temporary:
+        part = Path(temporary) / path.name
+        part.mkdir()
+        yield part
+        os.sync()  # one for all its files
+        os.replace(part, path)
 
 
 def _fps(cell: CellResults) -> float:

@@ -19,10 +19,11 @@ from vlagents_ray.errors import ConfigError
 from vlagents_ray.evaluate import EvalConfig, Results
 from vlagents_ray.evaluate.artifacts.storage import require_below
 from vlagents_ray.evaluate.episode.records import EpisodeResult
-from vlagents_ray.evaluate.merge import combined, merge
 from vlagents_ray.evaluate.plan.jobs import plan
 from vlagents_ray.evaluate.report.page import write_report
+from vlagents_ray.evaluate.results.combination import combined
 from vlagents_ray.evaluate.results.store import Store
+from vlagents_ray_results.merge import merge
 
 Config = Callable[..., EvalConfig]
 

@@ -1,0 +1,5 @@
+"""The fixtures of tests of results."""
+
+from evaluation_fixtures import commits_reach_the_disk, config
+
+__all__ = ["commits_reach_the_disk", "config"]

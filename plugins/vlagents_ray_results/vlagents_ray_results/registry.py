@@ -1,0 +1,22 @@
+"""What this distribution registers: an entry for each command, format of exports, and tracker."""
+
+from vlagents_ray.registry import RegistryEntry
+
+MERGE = RegistryEntry("vlagents_ray_results.commands:merge_command", "Merge results: each episode once, by its key.")
+BUNDLE = RegistryEntry(
+    "vlagents_ray_results.commands:bundle_command", "Write an evaluation as one file that others can verify."
+)
+VERIFY = RegistryEntry(
+    "vlagents_ray_results.commands:verify_command", "Check a bundle, and print what is equal or differs."
+)
+
+PARQUET = RegistryEntry("vlagents_ray_results.parquet:to_parquet", "a typed row for each episode")
+LEROBOT = RegistryEntry(
+    "vlagents_ray_results.lerobot:to_lerobot", "a LeRobotDataset v3.0 of the observations and actions, in a new folder"
+)
+
+WANDB = RegistryEntry("vlagents_ray_results.trackers:WandbRun", "Weights & Biases", needs=("wandb",), extra="wandb")
+TRACKIO = RegistryEntry("vlagents_ray_results.trackers:TrackioRun", "Trackio", needs=("trackio",), extra="trackio")
+TENSORBOARD = RegistryEntry(
+    "vlagents_ray_results.trackers:TensorboardRun", "TensorBoard", needs=("tensorboard",), extra="tensorboard"
+)
