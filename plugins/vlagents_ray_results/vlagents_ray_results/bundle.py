@@ -79,8 +79,8 @@ def pack(folder: Path, archive: Path) -> str:
     """
     paths = sorted(path for path in folder.rglob("*") if path.is_file())
     names = {path.relative_to(folder).as_posix(): path for path in paths}
-    if odd := [name for name in names if not _KNOWN.fullmatch(name) or name == MANIFEST]:
-        raise ConfigError(f"{folder}: got the files {odd[:5]}, which a bundle may not hold; rename or remove them")
+    if unknown := [name for name in names if not _KNOWN.fullmatch(name) or name == MANIFEST]:
+        raise ConfigError(f"{folder}: got the files {unknown[:5]}, which a bundle may not hold; rename or remove them")
     manifest = Manifest(files={name: digest_of(path) for name, path in names.items()})
     text = (manifest.model_dump_json(indent=1) + "\n").encode()
     with storage.whole(archive) as part, zipfile.ZipFile(part, "w", zipfile.ZIP_DEFLATED) as file:
@@ -122,21 +122,23 @@ def unpack(archive: Path, folder: Path, *, most_bytes: int = MOST_BYTES) -> tupl
         with zipfile.ZipFile(archive) as file:
             members = _checked(archive, file, most_bytes)
             manifest, sha256 = _manifest(archive, file, members.pop(MANIFEST, None))
-            found: dict[str, FileDigest] = {}
+            digests: dict[str, FileDigest] = {}
             for name, member in members.items():
                 target = folder / name
                 target.parent.mkdir(parents=True, exist_ok=True)
                 with file.open(member) as source, target.open("xb") as written:
-                    found[name] = _copy(archive, source, written, member)
+                    digests[name] = _copy(archive, source, written, member)
     except ConfigError:
         raise
     except _BROKEN as error:
         raise ConfigError(f"{archive}: cannot be read as a bundle ({error}); copy it again from its source") from error
-    stated = manifest.files
-    odd = [f"{name} is not in the bundle" for name in stated.keys() - found.keys()]
-    odd += [f"{name} is not in the manifest" for name in found.keys() - stated.keys()]
-    odd += [f"{name} has another digest" for name in stated.keys() & found.keys() if stated[name] != found[name]]
-    return manifest, sha256, sorted(odd)
+    listed = manifest.files
+    differences = [f"{name} is not in the bundle" for name in listed.keys() - digests.keys()]
+    differences += [f"{name} is not in the manifest" for name in digests.keys() - listed.keys()]
+    differences += [
+        f"{name} has another digest" for name in listed.keys() & digests.keys() if listed[name] != digests[name]
+    ]
+    return manifest, sha256, sorted(differences)
 
 
 def _checked(archive: Path, file: zipfile.ZipFile, most_bytes: int) -> dict[str, zipfile.ZipInfo]:
@@ -231,11 +233,14 @@ def write_bundle(folder: Path, archive: Path, *, videos: bool = False) -> str:
 def _link_files(folder: Path, stage: Path, results: Results, *, videos: bool) -> None:
     paths: list[str] = []
     for cell in results.cells:
-        for one in cell.episodes:
+        for episode in cell.episodes:
             if videos:
-                paths += one.videos
-            if one.trajectory is not None:
-                paths += [one.trajectory, *(storage.trajectory_videos(folder, one.trajectory) if videos else ())]
+                paths += episode.videos
+            if episode.trajectory is not None:
+                paths += [
+                    episode.trajectory,
+                    *(storage.trajectory_videos(folder, episode.trajectory) if videos else ()),
+                ]
     paths += [f"{storage.PROVENANCE}/{path.name}" for path in sorted((folder / storage.PROVENANCE).glob("*.diff"))]
     for path in dict.fromkeys(paths):
         source = storage.inside(folder, path)

@@ -74,21 +74,21 @@ def verify_command(
     from vlagents_ray_results.verification import verify
 
     with errors():
-        found = verify(bundle, into=into, replay=replay, seed=seed, trust=trust, most_bytes=int(max_gb * 1e9))
+        verification = verify(bundle, into=into, replay=replay, seed=seed, trust=trust, most_bytes=int(max_gb * 1e9))
         if as_json:
-            print_json({"holds": found.holds, **asdict(found)})
+            print_json({"holds": verification.holds, **asdict(verification)})
         else:
             rows = table("what", "found", "detail", box=None)
-            for one in found.findings:
-                rows.add_row(one.subject, one.verdict, one.detail)
+            for finding in verification.findings:
+                rows.add_row(finding.subject, finding.verdict, finding.detail)
             out.print(rows)
-            unchecked = [one.subject for one in found.findings if one.verdict == "not checked"]
-            verdict = "is contradicted" if not found.holds else "holds"
+            unchecked = [finding.subject for finding in verification.findings if finding.verdict == "not checked"]
+            verdict = "is contradicted" if not verification.holds else "holds"
             if unchecked:
                 verdict += f"; not checked: {', '.join(unchecked)}"
             if "replay" not in unchecked:
-                out.print(f"\nreplayed episodes were drawn by --seed {found.seed}")
-            out.print(f"bundle sha256:{found.digest}: {verdict}")
+                out.print(f"\nreplayed episodes were drawn by --seed {verification.seed}")
+            out.print(f"bundle sha256:{verification.digest}: {verdict}")
             if into is not None:
                 out.print(f"results: {into}")
-    raise typer.Exit(not found.holds)
+    raise typer.Exit(not verification.holds)

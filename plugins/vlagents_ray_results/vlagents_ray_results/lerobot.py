@@ -187,28 +187,28 @@ def _new_folder(path: Path) -> Iterator[Path]:
     path = path.resolve()
     path.parent.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory(prefix=f"{path.name}.part-", dir=path.parent) as temporary:
-        part = Path(temporary) / path.name
-        part.mkdir()
-        yield part
+        unfinished = Path(temporary) / path.name
+        unfinished.mkdir()
+        yield unfinished
         os.sync()  # one for all its files
-        os.replace(part, path)
+        os.replace(unfinished, path)
 
 
 def _fps(cell: CellResults) -> float:
     return float(cell.contract.get("control_hz") or DEFAULT_FPS)
 
 
-def _chosen(option: str, wanted: Sequence[str] | None, known: Sequence[str], env: str) -> list[str]:
-    if wanted is None:
+def _chosen(option: str, named: Sequence[str] | None, known: Sequence[str], env: str) -> list[str]:
+    if named is None:
         return list(known)
-    if unknown := [name for name in wanted if name not in known]:
+    if unknown := [name for name in named if name not in known]:
         raise ConfigError(
             f"{option}: {env} has no {', '.join(map(repr, unknown))}, want some of {sorted(known)}"
             f"{did_you_mean(unknown[0], known)}"
         )
-    if len(set(wanted)) < len(wanted):
-        raise ConfigError(f"{option}: got {list(wanted)}, want each of them once")
-    return list(wanted)
+    if len(set(named)) < len(named):
+        raise ConfigError(f"{option}: got {list(named)}, want each of them once")
+    return list(named)
 
 
 def _frames_until_rest(success: np.ndarray, moving: Sequence[np.ndarray]) -> int:
@@ -231,79 +231,85 @@ def _angles(demonstrations: Iterable[_Demonstration]) -> dict[int, Centre]:
     """Return the indices in `observation.state` of angles and rotation vectors that jump, with their centres."""
     angles: dict[int, list[np.ndarray]] = {}  # by place; each (N,)
     vectors: dict[int, list[np.ndarray]] = {}  # by their first place; each (N, 3)
-    for one in demonstrations:
-        place = 0
-        for part in one.parts:
-            values = one.state.get(part)  # None: the gripper, which is one number
-            spec = (one.contract.state or {}).get(part)
+    for demonstration in demonstrations:
+        index = 0
+        for part in demonstration.parts:
+            values = demonstration.state.get(part)  # None: the gripper, which is one number
+            spec = (demonstration.contract.state or {}).get(part)
             if values is not None and spec is not None:
                 dim = values.shape[1]
                 for i in angles_in(part, spec.unit, dim):
-                    angles.setdefault(place + i, []).append(values[:, i])
+                    angles.setdefault(index + i, []).append(values[:, i])
                 if (first := rotation_vector_in(part, spec.unit, dim)) is not None:
-                    vectors.setdefault(place + first, []).append(values[:, first : first + 3])
-            place += 1 if values is None else values.shape[1]
-    centres: dict[int, Centre | None] = {place: centre_of(episodes) for place, episodes in angles.items()}
-    centres |= {place: rotation_centre_of(episodes) for place, episodes in vectors.items()}
-    return {place: centre for place, centre in centres.items() if centre is not None}
+                    vectors.setdefault(index + first, []).append(values[:, first : first + 3])
+            index += 1 if values is None else values.shape[1]
+    centres: dict[int, Centre | None] = {index: centre_of(episodes) for index, episodes in angles.items()}
+    centres |= {index: rotation_centre_of(episodes) for index, episodes in vectors.items()}
+    return {index: centre for index, centre in centres.items() if centre is not None}
 
 
-def _finished(one: _Demonstration, angles: Mapping[int, Centre], folder: Path) -> FinishedEpisode:
+def _finished(demonstration: _Demonstration, angles: Mapping[int, Centre], folder: Path) -> FinishedEpisode:
     """Return the episode in the dataset's form, after putting its videos into `folder`."""
-    keys = camera_keys(one.videos)
+    keys = camera_keys(demonstration.videos)
     names = {key: camera for camera, key in keys.items()}
-    env, specs = one.contract, one.contract.state or {}
+    env, specs = demonstration.contract, demonstration.contract.state or {}
     contract = Contract(  # of a policy that is trained on the dataset: its actions are the env's, without bounds
-        cameras={camera: (env.cameras or {}).get(camera, CameraSpec()) for camera in one.videos},
-        state={part: replace(specs.get(part, StateSpec()), dim=values.shape[1]) for part, values in one.state.items()},
-        gripper=one.gripper is not None,
-        action=replace(env.action, dim=one.actions.shape[1], low=None, high=None),
+        cameras={camera: (env.cameras or {}).get(camera, CameraSpec()) for camera in demonstration.videos},
+        state={
+            part: replace(specs.get(part, StateSpec()), dim=values.shape[1])
+            for part, values in demonstration.state.items()
+        },
+        gripper=demonstration.gripper is not None,
+        action=replace(env.action, dim=demonstration.actions.shape[1], low=None, high=None),
         control_hz=env.control_hz,
     )
-    about = DatasetContract(contract, one.parts, names, angles, one.environment)
-    rows, features = _numbers(one, about)
+    about = DatasetContract(contract, demonstration.parts, names, angles, demonstration.environment)
+    rows, features = _numbers(demonstration, about)
     images: dict[str, Stats] = {}
     videos: dict[str, Path] = {}
-    for camera, video in one.videos.items():
-        key, seen, convert = keys[camera], ImageStatistics(), rgb_converter()
+    for camera, video in demonstration.videos.items():
+        key = keys[camera]
+        statistics = ImageStatistics()
+        convert = rgb_converter()
         with require("av").open(str(video)) as container:
             stream = container.streams.video[0]
-            for frame in islice(container.decode(stream), len(one.actions)):
-                seen.add(convert(frame))
-            images[key], features[key] = seen.result(), video_feature(stream.height, stream.width, _fps(one.cell))
+            for frame in islice(container.decode(stream), len(demonstration.actions)):
+                statistics.add(convert(frame))
+            images[key] = statistics.result()
+            features[key] = video_feature(stream.height, stream.width, _fps(demonstration.cell))
         videos[key] = folder / f"{key}.mp4"
         link_or_copy(video, videos[key])
-    return FinishedEpisode(one.episode.result.instruction, features, rows, images, videos, about)
+    return FinishedEpisode(demonstration.episode.result.instruction, features, rows, images, videos, about)
 
 
-def _numbers(one: _Demonstration, about: DatasetContract) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
+def _numbers(demonstration: _Demonstration, about: DatasetContract) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
     """Return rows and features: the state in one vector and part by part, the action, and its outcome."""
-    dim = one.actions.shape[1]
-    together, names = state_vector(one.state, one.gripper, one.parts)
+    dim = demonstration.actions.shape[1]
+    together, names = state_vector(demonstration.state, demonstration.gripper, demonstration.parts)
     together = about.wrapped(together)
-    rows: dict[str, Any] = {ACTION: one.actions, **outcome_rows(one.rewards, one.success)}
+    rows: dict[str, Any] = {ACTION: demonstration.actions, **outcome_rows(demonstration.rewards, demonstration.success)}
     features = {ACTION: vector_feature([f"action_{i}" for i in range(dim)]), **number_features(OUTCOMES | INDEX)}
-    features[ACTION]["spec"] = one.cell.contract.get("action")
+    features[ACTION]["spec"] = demonstration.cell.contract.get("action")
     if names:
         rows[STATE], features[STATE] = together, vector_feature(names)
-    if one.environment:
-        rows[ENVIRONMENT], names = state_vector(one.state, None, one.environment)
+    if demonstration.environment:
+        rows[ENVIRONMENT], names = state_vector(demonstration.state, None, demonstration.environment)
         features[ENVIRONMENT] = vector_feature(names)
-    if one.versions is not None:
-        rows[VERSION] = one.versions
+    if demonstration.versions is not None:
+        rows[VERSION] = demonstration.versions
         features |= number_features({VERSION: "int64"})
-    keys = distinct([part for part in one.parts if part in one.state], without_slash)
-    place = 0
-    for part in one.parts:
-        if part not in one.state:
-            rows[GRIPPER_FEATURE] = one.gripper
+    keys = distinct([part for part in demonstration.parts if part in demonstration.state], without_slash)
+    index = 0
+    for part in demonstration.parts:
+        if part not in demonstration.state:
+            rows[GRIPPER_FEATURE] = demonstration.gripper
             features |= number_features({GRIPPER_FEATURE: "float32"})
-            place += 1
+            index += 1
             continue
-        width = one.state[part].shape[1]
+        width = demonstration.state[part].shape[1]
         key = f"{STATE}.{keys[part]}"
-        rows[key] = together[:, place : place + width]
+        rows[key] = together[:, index : index + width]
         features[key] = vector_feature([f"{part}_{i}" for i in range(width)])
-        features[key]["unit"] = getattr((one.contract.state or {}).get(part), "unit", None)
-        place += width
+        features[key]["unit"] = getattr((demonstration.contract.state or {}).get(part), "unit", None)
+        index += width
     return rows, features

@@ -76,17 +76,17 @@ def merge(out: Path, folders: Sequence[Path], *, keep_first: bool = False, accep
     conflicts: list[str] = []
     for folder in folders:
         with reading(folder) as db:
-            found = _add_policies(merged, folder, db) + _add_cells(merged, folder, db)
-            if found and not accept_changes:
+            changes = _add_policies(merged, folder, db) + _add_cells(merged, folder, db)
+            if changes and not accept_changes:
                 raise ConfigError(
-                    f"{folder} was not played with the same program as the folders before it:\n{listed(found)}\n"
+                    f"{folder} was not played with the same program as the folders before it:\n{listed(changes)}\n"
                     f"merge them apart, or mix them and have the report say so (--accept-changes)"
                 )
             conflicts += _add_episodes(merged, folder, db)
-            if found:
+            if changes:
                 last = merged.runs[-1]
                 earlier = json.loads(last["changes"] or "[]")
-                last["changes"] = canonical([*earlier, *(asdict(one) for one in found)])
+                last["changes"] = canonical([*earlier, *(asdict(change) for change in changes)])
     _require_one_checkpoint(merged, weights_may_differ=accept_changes)
     if conflicts and not keep_first:
         shown = "\n".join(f"- {text}" for text in conflicts[:_SHOWN])
@@ -104,7 +104,7 @@ def merge(out: Path, folders: Sequence[Path], *, keep_first: bool = False, accep
             "attempts": merged.attempts,
             "workers": merged.workers,
         }
-        with storage.whole(out / FILE) as part, closing(sqlite3.connect(part)) as db:
+        with storage.whole(out / FILE) as unfinished, closing(sqlite3.connect(unfinished)) as db:
             create(db)
             with db:
                 for name, row in ((name, row) for name, rows in tables.items() for row in rows):
@@ -116,19 +116,19 @@ def merge(out: Path, folders: Sequence[Path], *, keep_first: bool = False, accep
 
 
 def _add_policies(merged: _Merged, folder: Path, db: sqlite3.Connection) -> list[Change]:
-    found = []
+    changes = []
     swept = {name for (name,) in db.execute("SELECT DISTINCT policy FROM cells WHERE step IS NOT NULL")}
     for row in table(db, "policies"):
         known = merged.policies.setdefault(row["name"], row)
         before, now = json.loads(known["metadata"]), json.loads(row["metadata"])
         is_swept = row["name"] in swept
-        found += policy_changes(f"policy {row['name']}", before, now, swept=is_swept)
+        changes += policy_changes(f"policy {row['name']}", before, now, swept=is_swept)
         if (what := changed(before, now, swept=is_swept)) in ("policy", "checkpoint"):
             raise ConfigError(
                 f"{folder}: policy {row['name']!r} has {what} {now.get(what)!r}, that of the folders before it "
                 f"{before.get(what)!r}; give one of them another name in its evaluation"
             )
-    return found
+    return changes
 
 
 def _add_cells(merged: _Merged, folder: Path, db: sqlite3.Connection) -> list[Change]:
@@ -138,19 +138,21 @@ def _add_cells(merged: _Merged, folder: Path, db: sqlite3.Connection) -> list[Ch
         known = merged.cells.get(row["cell"]) or names.setdefault(_name(row), row)  # a suite may have a new name
         if known["cell"] != row["cell"]:
             before, now = json.loads(known["settings"]), json.loads(row["settings"])
-            odd = [f"{k}: {before.get(k)!r} and {now.get(k)!r}" for k in now if before.get(k) != now.get(k)]
-            raise ConfigError(f"{folder}: {' '.join(filter(None, _name(row)))} has other settings: {'; '.join(odd)}")
+            differing = [f"{k}: {before.get(k)!r} and {now.get(k)!r}" for k in now if before.get(k) != now.get(k)]
+            raise ConfigError(
+                f"{folder}: {' '.join(filter(None, _name(row)))} has other settings: {'; '.join(differing)}"
+            )
         if known is row:
             merged.cells[row["cell"]] = row
             continue
         if known["stop"] != row["stop"]:
             where = " ".join(filter(None, _name(row)))
             raise ConfigError(f"{folder}: {where} stops early by {row['stop']}, that before it by {known['stop']}")
-        programs = [None if one["program"] is None else json.loads(one["program"]) for one in (known, row)]
+        programs = [None if cell["program"] is None else json.loads(cell["program"]) for cell in (known, row)]
         changes |= dict.fromkeys(program_changes(f"env {row['env']}", *programs))
         statements = [
-            EnvStatement(json.loads(one["described"] or "{}"), json.loads(one["contract"] or "{}"))
-            for one in (known, row)
+            EnvStatement(json.loads(cell["described"] or "{}"), json.loads(cell["contract"] or "{}"))
+            for cell in (known, row)
         ]
         changes |= dict.fromkeys(env_changes(row["env"], *statements))
         for name in ("described", "contract", "code", "program"):
@@ -192,10 +194,12 @@ def _add_episodes(merged: _Merged, folder: Path, db: sqlite3.Connection) -> list
         if known is None or (known["status"] == "infra_failed" and row["status"] != "infra_failed"):
             merged.episodes[row["key"]], merged.home[row["key"]] = row, folder
         elif row["status"] != "infra_failed":
-            before, now = (episode_of(dict(one)).result.outcome for one in (known, row))
-            odd = [f"{name} is {before[name]!r} and {now[name]!r}" for name in before if before[name] != now[name]]
-            if odd:
-                conflicts.append(f"{row['key']}: {', '.join(odd)} in {merged.home[row['key']]} and {folder}")
+            before, now = (episode_of(dict(episode)).result.outcome for episode in (known, row))
+            differing = [
+                f"{name} is {before[name]!r} and {now[name]!r}" for name in before if before[name] != now[name]
+            ]
+            if differing:
+                conflicts.append(f"{row['key']}: {', '.join(differing)} in {merged.home[row['key']]} and {folder}")
     return conflicts
 
 

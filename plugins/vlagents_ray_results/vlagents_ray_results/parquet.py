@@ -20,7 +20,7 @@ def to_parquet(results: Results, path: Path) -> int:
         "time": pa.timestamp("us", "UTC"), "json": pa.string(),
     }  # fmt: skip
     fields = [pa.field(column.name, types[column.type], metadata={"meaning": column.meaning}) for column in COLUMNS]
-    found = list(rows(results, flat=True))
-    with whole(path) as part:
-        require("pyarrow.parquet").write_table(pa.Table.from_pylist(found, pa.schema(fields)), part)
-    return len(found)
+    table_rows = list(rows(results, flat=True))
+    with whole(path) as unfinished:
+        require("pyarrow.parquet").write_table(pa.Table.from_pylist(table_rows, pa.schema(fields)), unfinished)
+    return len(table_rows)

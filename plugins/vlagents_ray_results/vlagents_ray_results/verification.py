@@ -72,7 +72,7 @@ class Verification:
     @property
     def holds(self) -> bool:
         """Whether nothing contradicts the bundle."""
-        return all(one.verdict != "differs" for one in self.findings)
+        return all(finding.verdict != "differs" for finding in self.findings)
 
 
 def verify(
@@ -117,9 +117,9 @@ def verify(
         with tempfile.TemporaryDirectory(prefix="bundle.part-", dir=parent) as temporary:
             folder = Path(temporary) / (into or bundle).name  # the name is in the report
             folder.mkdir()
-            manifest, digest, odd = unpack(bundle, folder, most_bytes=most_bytes)
+            manifest, digest, differences = unpack(bundle, folder, most_bytes=most_bytes)
             fine = f"{len(manifest.files)} files have the SHA-256 that {MANIFEST} states"
-            findings = [_finding("digests", odd, fine)]
+            findings = [_finding("digests", differences, fine)]
             try:
                 findings += _check(folder, replay, seed, trust=trust)
             except (VLAgentsError, sqlite3.Error):
@@ -151,7 +151,7 @@ def _check(folder: Path, replay: int, seed: int, *, trust: bool) -> Iterator[Fin
         yield Finding("replay", "not checked", "was not asked for (--replay 0)")
         return
     drawn = ((*pair, _recorded(results, pair[1])) for pair in _drawn(results, seed))
-    chosen = list(islice((one for one in drawn if one[2] is not None), replay))
+    chosen = list(islice((candidate for candidate in drawn if candidate[2] is not None), replay))
     if not chosen:
         yield Finding("replay", "not checked", "no finished episode has a recording (eval --record all)")
     for cell, episode, trajectory in chosen:
@@ -162,7 +162,9 @@ def _check(folder: Path, replay: int, seed: int, *, trust: bool) -> Iterator[Fin
 def _drawn(results: Results, seed: int) -> Iterator[tuple[CellResults, Episode]]:
     """Yield the finished episodes in a random order: one of each cell in turns, so that each cell is checked."""
     draw = random.Random(seed)
-    cells = [[(cell, one) for one in cell.episodes if one.result.status == "done"] for cell in results.cells]
+    cells = [
+        [(cell, episode) for episode in cell.episodes if episode.result.status == "done"] for cell in results.cells
+    ]
     draw.shuffle(cells)
     for episodes in cells:
         draw.shuffle(episodes)
@@ -172,24 +174,28 @@ def _drawn(results: Results, seed: int) -> Iterator[tuple[CellResults, Episode]]
 
 def _check_cells(results: Results) -> Finding:
     """Check that cells and keys of episodes are those of their settings, and that nothing was mixed or left out."""
-    odd = []
+    contradictions = []
     rules = {json.dumps(run.config.get("stop"), sort_keys=True) for run in results.runs}
     for cell in results.cells:
         name = f"{cell.contender} in {cell.task}"
         named = cell.settings.get("env"), cell.settings.get("policy")
         if fingerprint(cell.settings) != cell.cell or named != (cell.env, cell.policy):
-            odd.append(f"{name}: its settings are not those of its key")
+            contradictions.append(f"{name}: its settings are not those of its key")
         rule = None if cell.stop is None else cell.stop.model_dump(mode="json")
         if json.dumps(rule, sort_keys=True) not in rules:
-            odd.append(f"{name}: no run stopped early by its rule")
-        keys_of_cell = [one.result.key for one in cell.episodes]
-        odd += [f"{key}: is of another cell or env" for key in keys_of_cell if key.env != cell.env]
-        odd += [f"{name}: {text}" for text in _mixtures(results, cell)]
-    stated = {str(one.result.key) for cell in results.cells for one in cell.episodes}
+            contradictions.append(f"{name}: no run stopped early by its rule")
+        keys_of_cell = [episode.result.key for episode in cell.episodes]
+        contradictions += [f"{key}: is of another cell or env" for key in keys_of_cell if key.env != cell.env]
+        contradictions += [f"{name}: {text}" for text in _mixtures(results, cell)]
+    known_keys = {str(episode.result.key) for cell in results.cells for episode in cell.episodes}
     with reading(results.out) as db:
         keys = {row["key"] for row in table(db, "episodes")}
-    odd += [f"{key}: its key does not match its columns, or it has no cell" for key in sorted(keys - stated)]
-    return _finding("database", odd, f"{len(results.cells)} cells and {len(keys)} episodes have their settings' keys")
+    contradictions += [
+        f"{key}: its key does not match its columns, or it has no cell" for key in sorted(keys - known_keys)
+    ]
+    return _finding(
+        "database", contradictions, f"{len(results.cells)} cells and {len(keys)} episodes have their settings' keys"
+    )
 
 
 # Of all episodes of a cell. A run whose change was accepted may have added another one; checkpoints are never mixed.
@@ -202,19 +208,19 @@ def _mixtures(results: Results, cell: CellResults) -> Iterator[str]:
         if results.accepted_changes and column != "checkpoint":
             continue
         if column.endswith("_program"):
-            values = {getattr(one, column) for one in cell.episodes if one.counts}
+            values = {getattr(episode, column) for episode in cell.episodes if episode.counts}
         else:  # unknown for an episode that failed in the policy's reset
-            values = {getattr(one.result, column) for one in cell.episodes} - {None}
+            values = {getattr(episode.result, column) for episode in cell.episodes} - {None}
         if len(values) > 1:
             yield f"its episodes have {len(values)} values of {column}, and no accepted change says so"
     fingerprints: dict[int, set[str]] = {}
-    for one in cell.episodes:
-        if one.result.policy_version is not None and one.result.policy_fingerprint is not None:
-            fingerprints.setdefault(one.result.policy_version, set()).add(one.result.policy_fingerprint)
+    for episode in cell.episodes:
+        if episode.result.policy_version is not None and episode.result.policy_fingerprint is not None:
+            fingerprints.setdefault(episode.result.policy_version, set()).add(episode.result.policy_fingerprint)
     for version, several in fingerprints.items():
         if len(several) > 1:
             yield f"version {version} of the weights has {len(several)} fingerprints"
-    if any(one.unplanned for one in cell.episodes) and not any(
+    if any(episode.unplanned for episode in cell.episodes) and not any(
         change.subject == "plan" for change in results.accepted_changes
     ):
         yield "it has episodes beyond its plan, in no rate, and no accepted change says that the plan became smaller"
@@ -222,7 +228,7 @@ def _mixtures(results: Results, cell: CellResults) -> Iterator[str]:
 
 def _check_episodes(results: Results) -> Finding:
     """Check that the columns of each episode do not contradict each other."""
-    odd: list[str] = []
+    contradictions: list[str] = []
     runs = {run.run for run in results.runs}
     recordings: dict[str, int] = {}
     number = 0
@@ -232,13 +238,17 @@ def _check_episodes(results: Results) -> Finding:
             texts = list(_inconsistencies(cell, episode))
             if episode.run not in runs:
                 texts.append(f"there is no run {episode.run}")
-            odd += [f"{episode.result.key}: {text}" for text in texts]
+            contradictions += [f"{episode.result.key}: {text}" for text in texts]
             if episode.trajectory is not None:
                 recordings[episode.trajectory] = recordings.get(episode.trajectory, 0) + 1
-    odd += [f"{path}: is the recording of {times} episodes" for path, times in recordings.items() if times > 1]
+    contradictions += [
+        f"{path}: is the recording of {times} episodes" for path, times in recordings.items() if times > 1
+    ]
     there = (path.relative_to(results.out) for path in (results.out / storage.TRAJECTORIES).rglob("*.npz"))
-    odd += [f"{path}: is the recording of no episode" for path in sorted(map(str, there)) if path not in recordings]
-    return _finding("episodes", odd, f"{number} have outcomes without contradiction")
+    contradictions += [
+        f"{path}: is the recording of no episode" for path in sorted(map(str, there)) if path not in recordings
+    ]
+    return _finding("episodes", contradictions, f"{number} have outcomes without contradiction")
 
 
 def _inconsistencies(cell: CellResults, episode: Episode) -> Iterator[str]:
@@ -281,22 +291,27 @@ def _inconsistencies(cell: CellResults, episode: Episode) -> Iterator[str]:
 
 def _check_trajectories(results: Results) -> Finding:
     """Check that each recording has the actions, steps, rewards and success of its episode in the table."""
-    odd: list[str] = []
+    contradictions: list[str] = []
     checked, missing = 0, 0
     for cell in results.cells:
-        for one in cell.episodes:
-            if one.result.status == "infra_failed":
+        for episode in cell.episodes:
+            if episode.result.status == "infra_failed":
                 continue
-            if (trajectory := _recorded(results, one)) is None:
+            if (trajectory := _recorded(results, episode)) is None:
                 missing += 1
                 continue
             checked += 1
             synchronous = cell.settings.get("clock") is None
-            odd += [f"{one.result.key}: {text}" for text in _contradictions(one, trajectory, synchronous=synchronous)]
-    if not checked and not odd:
+            contradictions += [
+                f"{episode.result.key}: {text}"
+                for text in _contradictions(episode, trajectory, synchronous=synchronous)
+            ]
+    if not checked and not contradictions:
         return Finding("trajectories", "not checked", f"the bundle has none of {missing} episodes (eval --record all)")
     rest = f"; {missing} others have none, so that their outcomes are only stated" if missing else ""
-    return _finding("trajectories", odd, f"{checked} have the actions, rewards and outcomes of the table{rest}")
+    return _finding(
+        "trajectories", contradictions, f"{checked} have the actions, rewards and outcomes of the table{rest}"
+    )
 
 
 def _recorded(results: Results, episode: Episode) -> Trajectory | None:
@@ -353,26 +368,26 @@ def _outcome(success: list[bool]) -> tuple[bool, bool, int | None]:
     return first is not None, bool(success and success[-1]), first
 
 
-def _finding(subject: str, odd: list[str], fine: str) -> Finding:
-    if not odd:
+def _finding(subject: str, contradictions: list[str], fine: str) -> Finding:
+    if not contradictions:
         return Finding(subject, "equal", fine)
-    more = f"; and {len(odd) - _SHOWN} more" if len(odd) > _SHOWN else ""
-    return Finding(subject, "differs", "; ".join(odd[:_SHOWN]) + more)
+    more = f"; and {len(contradictions) - _SHOWN} more" if len(contradictions) > _SHOWN else ""
+    return Finding(subject, "differs", "; ".join(contradictions[:_SHOWN]) + more)
 
 
 def _check_versions(results: Results) -> Finding:
     """Compare the software of the last run with that here."""
     there, here = results.runs[-1].versions, storage.versions()
-    stated = {name: (there.get(name), version) for name, version in here.items() if name != "code"}
-    stated |= {"commit": (_commit(there), _commit(here))}
-    odd = [f"{name} {was} there, {now} here" for name, (was, now) in stated.items() if was != now]
-    if odd:
-        return Finding("versions", "other here", "; ".join(odd))
-    return Finding("versions", "equal", ", ".join(f"{name} {now}" for name, (_, now) in stated.items()))
+    compared = {name: (there.get(name), version) for name, version in here.items() if name != "code"}
+    compared |= {"commit": (_commit(there), _commit(here))}
+    differences = [f"{name} {was} there, {now} here" for name, (was, now) in compared.items() if was != now]
+    if differences:
+        return Finding("versions", "other here", "; ".join(differences))
+    return Finding("versions", "equal", ", ".join(f"{name} {now}" for name, (_, now) in compared.items()))
 
 
-def _commit(found: Mapping[str, Any]) -> str:
-    code = found.get("code")
+def _commit(versions: Mapping[str, Any]) -> str:
+    code = versions.get("code")
     state = code.get("vlagents_ray") if isinstance(code, dict) else None
     if not isinstance(state, dict) or state.get("commit") is None:
         return "unknown"
@@ -406,15 +421,15 @@ def _difference(recorded: Trajectory, number: int, obs: Obs, step: EnvStep | Non
         pairs.append((recorded.gripper[number], np.asarray(obs.gripper, np.float32)))
     if step is not None:
         pairs.append((recorded.rewards[number - 1], np.asarray(step.reward, np.float64)))
-    odd = []
+    differences = []
     for then, now in pairs:
         if then.shape != now.shape:
-            odd.append(float("inf"))
+            differences.append(float("inf"))
         elif then.tobytes() != now.tobytes():
-            odd.append(float(np.max(np.abs(np.asarray(then, np.float64) - np.asarray(now, np.float64)))))
+            differences.append(float(np.max(np.abs(np.asarray(then, np.float64) - np.asarray(now, np.float64)))))
     if step is not None and bool(recorded.success[number - 1]) != step.success:
-        odd.append(0.0)
-    return max(odd, default=None)
+        differences.append(0.0)
+    return max(differences, default=None)
 
 
 def require_harmless(cell: CellResults) -> None:
@@ -427,10 +442,10 @@ def require_harmless(cell: CellResults) -> None:
     if env_suite(cell.env) not in names("envs") or ":" in cell.env:
         raise ConfigError(f"{cell.env}: is no registered environment; --trust makes it, and runs its code")
     for kind in ("env_options", "reset_options"):
-        stated = cell.settings.get(kind) or {}
-        odd = {name: value for name, value in stated.items() if _CODE.fullmatch(name) or not _is_plain(value)}
-        if odd:
-            raise ConfigError(f"{cell.env}: got the {kind} {odd}, which could name files or code; --trust takes them")
+        options = cell.settings.get(kind) or {}
+        risky = {name: value for name, value in options.items() if _CODE.fullmatch(name) or not _is_plain(value)}
+        if risky:
+            raise ConfigError(f"{cell.env}: got the {kind} {risky}, which could name files or code; --trust takes them")
 
 
 def replay_actions(cell: CellResults, episode: Episode, trajectory: Trajectory) -> Replayed:
@@ -481,7 +496,7 @@ def _ending(last: EnvStep | None, steps: int, limit: int) -> Ending:
 
 def _is_plain(value: object) -> bool:
     if isinstance(value, list):
-        return all(_is_plain(one) for one in value)
+        return all(_is_plain(item) for item in value)
     if isinstance(value, str):
         return _WORD.fullmatch(value) is not None
     return value is None or isinstance(value, bool | int | float)
@@ -518,11 +533,11 @@ def _replay(cell: CellResults, episode: Episode, trajectory: Trajectory, *, trus
     if first is not None:
         detail = f"the same outcome, other numbers; {differs}"
     described, described_here = cell.described, played.described
-    odd = [
+    differing = [
         f"{name} {str(described_here.get(name))[:_LENGTH]}, there {str(described.get(name))[:_LENGTH]}"
         for name in sorted(described.keys() | described_here.keys())
         if described.get(name) != described_here.get(name)
     ]
-    if odd:
-        detail += f"; the environment says of itself here: {'; '.join(odd)}"
+    if differing:
+        detail += f"; the environment says of itself here: {'; '.join(differing)}"
     return Finding(subject, "equal" if first is None else "other here", detail)

@@ -38,31 +38,10 @@ def combined(folders: Sequence[Results]) -> Results:
         raise ConfigError("report: got no folder, want one or more that evaluations wrote their results to")
     if len(folders) == 1:
         return folders[0]
-    require_distinct(each.out for each in folders)
-    seen: dict[str, Path] = {}
-    for each in folders:
-        for cell in each.cells:
-            if (first := seen.setdefault(cell.cell, each.out)) is not each.out:
-                raise ConfigError(
-                    f"report: {first} and {each.out} both have {cell.contender!r} in {cell.env!r} with the same "
-                    f"settings; put parts of one evaluation into one folder first: `vlagents-ray merge {first} "
-                    f"{each.out} --out OUT`, with --accept-changes if code or weights changed between them"
-                )
-    every = [cell for each in folders for cell in each.cells]
-    counts = Counter((cell.contender, cell.suite, cell.env) for cell in every)
-    clashing = {cell.policy for cell in every if counts[cell.contender, cell.suite, cell.env] > 1}
-    known: dict[tuple[str, str | None], str] = {}  # the weights by policy id and checkpoint
-    for cell in every:
-        weights, checkpoint = stated(cell, "weights"), stated(cell, "checkpoint")
-        if weights is not None and known.setdefault((cell.contender, checkpoint), weights) != weights:
-            clashing.add(cell.policy)
-    swept = {cell.policy for cell in every if cell.step is not None}
-    metadata: dict[str, dict[str, Any]] = {}  # of the first folder with the policy
-    for each in folders:
-        for name, of_server in each.policies.items():
-            if changed(metadata.setdefault(name, of_server), of_server, swept=name in swept) is not None:
-                clashing.add(name)
-    homes = [each.out.resolve() for each in folders]
+    require_distinct(results.out for results in folders)
+    _require_different_evaluations(folders)
+    clashing = _clashing_policies(folders)
+    homes = [results.out.resolve() for results in folders]
     base = Path(os.path.commonpath(homes))
     cells: list[CellResults] = []
     runs: list[Run] = []
@@ -72,22 +51,57 @@ def combined(folders: Sequence[Results]) -> Results:
     labels = [home.name for home in homes]
     if len(set(labels)) < len(labels):
         labels = [str(home.relative_to(base)) for home in homes]
-    for each, home, label in zip(folders, homes, labels, strict=True):
-        names = {
-            cell.policy: f"{cell.policy} ({label})" if cell.policy in clashing else cell.policy for cell in each.cells
-        }
+    for results, home, label in zip(folders, homes, labels, strict=True):
+        names = {}
+        for cell in results.cells:
+            names[cell.policy] = f"{cell.policy} ({label})" if cell.policy in clashing else cell.policy
+        earlier_runs = len(runs)
         prefix = home.relative_to(base)
-        for cell in each.cells:
-            episodes = tuple(
-                replace(one, run=one.run + len(runs), videos=tuple(str(prefix / video) for video in one.videos))
-                for one in cell.episodes
-            )
-            attempts = tuple(replace(one, run=one.run + len(runs)) for one in cell.attempts)
-            cells.append(replace(cell, policy=names[cell.policy], episodes=episodes, attempts=attempts))
-        policies |= {names.get(name, name): said for name, said in each.policies.items()}
-        workers += [
-            replace(one, policy=names.get(one.policy, one.policy), run=one.run + len(runs)) for one in each.workers
-        ]
-        runs += [replace(run, run=run.run + len(runs)) for run in each.runs]
+        for cell in results.cells:
+            episodes = []
+            for episode in cell.episodes:
+                videos = tuple(str(prefix / video) for video in episode.videos)
+                episodes.append(replace(episode, run=episode.run + earlier_runs, videos=videos))
+            attempts = [replace(attempt, run=attempt.run + earlier_runs) for attempt in cell.attempts]
+            renamed = names[cell.policy]
+            cells.append(replace(cell, policy=renamed, episodes=tuple(episodes), attempts=tuple(attempts)))
+        for policy, of_server in results.policies.items():
+            policies[names.get(policy, policy)] = of_server
+        for worker in results.workers:
+            renamed = names.get(worker.policy, worker.policy)
+            workers.append(replace(worker, policy=renamed, run=worker.run + earlier_runs))
+        runs += [replace(run, run=run.run + earlier_runs) for run in results.runs]
     parts = tuple(sorted(homes, reverse=True))  # subfolders before their parents
     return Results(base, tuple(cells), tuple(runs), policies, tuple(workers), parts)
+
+
+def _require_different_evaluations(folders: Sequence[Results]) -> None:
+    """Raise `ConfigError` if two folders have the same cell, as parts of one evaluation do."""
+    first_folders: dict[str, Path] = {}
+    for results in folders:
+        for cell in results.cells:
+            if (first := first_folders.setdefault(cell.cell, results.out)) is not results.out:
+                raise ConfigError(
+                    f"report: {first} and {results.out} both have {cell.contender!r} in {cell.env!r} with the same "
+                    f"settings; put parts of one evaluation into one folder first: `vlagents-ray merge {first} "
+                    f"{results.out} --out OUT`, with --accept-changes if code or weights changed between them"
+                )
+
+
+def _clashing_policies(folders: Sequence[Results]) -> set[str]:
+    """Return the policies that are not the same in all folders, or are in one env more than once."""
+    all_cells = [cell for results in folders for cell in results.cells]
+    counts = Counter((cell.contender, cell.suite, cell.env) for cell in all_cells)
+    clashing = {cell.policy for cell in all_cells if counts[cell.contender, cell.suite, cell.env] > 1}
+    weights_by_checkpoint: dict[tuple[str, str | None], str] = {}  # by policy id and checkpoint
+    for cell in all_cells:
+        weights, checkpoint = stated(cell, "weights"), stated(cell, "checkpoint")
+        if weights is not None and weights_by_checkpoint.setdefault((cell.contender, checkpoint), weights) != weights:
+            clashing.add(cell.policy)
+    swept = {cell.policy for cell in all_cells if cell.step is not None}
+    metadata: dict[str, dict[str, Any]] = {}  # of the first folder with the policy
+    for results in folders:
+        for name, of_server in results.policies.items():
+            if changed(metadata.setdefault(name, of_server), of_server, swept=name in swept) is not None:
+                clashing.add(name)
+    return clashing
