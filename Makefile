@@ -29,7 +29,7 @@ SHELL := /bin/bash
 VENV ?= .venv
 TORCH ?= torch==2.13.0
 # Those of plugins/vlagents_ray_NAME that `make setup` installs beside the core.
-PLUGINS ?= arro cluster dialects learn results robot sims
+PLUGINS ?= arro cluster dialects learn models results robot sims
 TORCH_INDEX_URL ?=
 TORCH_CUDA ?=
 PYTHON ?= $(shell for python in python3.11 python3; do \
@@ -146,7 +146,7 @@ programs: setup $(patsubst %,$(VENV)-%/.installed,$(filter lerobot%,$(FAMILIES))
 	status=0; options='-p no:cacheprovider -m program --verified'; \
 	$(BIN)/python -m pytest $$options $(PROGRAMS) || status=1; \
 	for family in $(filter lerobot%,$(FAMILIES)); do \
-	  $(VENV)-$$family/bin/python -m pytest $$options tests/families/lerobot || status=1; done; \
+	  $(VENV)-$$family/bin/python -m pytest $$options plugins/vlagents_ray_models/tests/families/lerobot || status=1; done; \
 	$(BIN)/python tests/support/tables.py; exit $$status
 
 # Made once for each state of the family's requirements, of what a server installs and of what `env make` adds: not removed as a mere step.

@@ -55,7 +55,7 @@ def public_names() -> Iterator[tuple[str, Any]]:
     for module in MODULES:
         loaded = importlib.import_module(module)
         yield from ((f"{module}.{name}", getattr(loaded, name)) for name in loaded.__all__)
-    for one in registry.POLICIES.values():
+    for one in registry.entries("policies").values():
         module, _, name = one.target.partition(":")
         yield f"{module}.{name}", getattr(importlib.import_module(module), name)
 

@@ -65,7 +65,7 @@ def test_a_simulators_environment_is_for_the_workers_and_a_policys_for_its_deplo
 @pytest.mark.usefixtures("nothing_installed")
 def test_a_missing_simulator_or_runtime_is_cured_by_its_extra() -> None:
     assert cure("mani_skill.envs") == "pip install 'vlagents-ray[maniskill]'"
-    assert cure("onnxruntime") == "pip install 'vlagents-ray[onnx]'"
+    assert cure("onnxruntime") == "pip install 'vlagents-ray-models[onnx]'"
 
 
 @pytest.mark.usefixtures("nothing_installed")
@@ -75,7 +75,8 @@ def test_a_package_that_no_requirements_file_installs_is_cured_by_pip() -> None:
 
 def required() -> Iterator[str]:
     """The top-level packages that the code imports through `require`."""
-    for path in (ROOT / "vlagents_ray").rglob("*.py"):
+    packages = (ROOT / "vlagents_ray", ROOT / "plugins/vlagents_ray_models/vlagents_ray_models")
+    for path in (path for package in packages for path in package.rglob("*.py")):
         for node in ast.walk(ast.parse(path.read_text())):
             match node:
                 case ast.Call(func=ast.Name("require"), args=[ast.Constant(str(module))]):
@@ -94,7 +95,7 @@ def test_the_extras_and_files_that_cures_name_exist() -> None:
     for entry in adapters:
         project = tomllib.loads((ROOT / tables.folder_of(entry) / "pyproject.toml").read_text())["project"]
         assert entry.extra is None or entry.extra in project["optional-dependencies"]
-    assert {one.requirements[0] for one in registry.POLICIES.values() if one.requirements} == set(FAMILIES)
+    assert {one.requirements[0] for one in registry.entries("policies").values() if one.requirements} == set(FAMILIES)
     for file in {file for one in adapters for file in one.requirements}:
         assert (ROOT / f"requirements/{file}.txt").exists()
 

@@ -86,7 +86,7 @@ def test_outcomes_are_noted_by_family_and_test(tmp_path: Path, monkeypatch: pyte
         ("c", "setup", "skipped"),
     ):
         report = pytest.TestReport(
-            f"tests/families/pi0/test_it.py::test_x[{case}]",
+            f"plugins/vlagents_ray_models/tests/families/pi0/test_it.py::test_x[{case}]",
             ("", 0, ""),
             {},
             outcome,

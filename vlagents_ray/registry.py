@@ -55,82 +55,6 @@ class RegistryEntry:
 
 
 POLICIES: dict[str, RegistryEntry] = {
-    "lerobot": RegistryEntry(
-        "vlagents_ray.policies.lerobot:LeRobot",
-        "ACT, Diffusion, multi-task DiT, SmolVLA, X-VLA, GR00T N1.7, VQ-BeT, TD-MPC, π0, π0.5 and others of LeRobot "
-        "0.4 and 0.6",
-        needs=("lerobot", "torch", "transformers"),
-        requirements=("lerobot", "lerobot06"),
-    ),
-    "gr00t": RegistryEntry(
-        "vlagents_ray.policies.gr00t:Gr00t",
-        "GR00T N1.6 and N1.7 by NVIDIA",
-        needs=("gr00t", "transformers", "torch", "diffusers"),
-        requirements=("gr00t", "lerobot06"),
-        checkouts=("GR00T_SRC",),
-        deployment="isaac_gr00t",
-    ),
-    "pi0": RegistryEntry(
-        "vlagents_ray.policies.pi0:Pi0",
-        "π0 in Hugging Face transformers",
-        needs=("transformers", "torch"),
-        requirements=("hf",),
-    ),
-    "openpi": RegistryEntry(
-        "vlagents_ray.policies.openpi:OpenPi",
-        "π0, π0.5, π0-FAST by Physical Intelligence, JAX and PyTorch",
-        needs=("openpi", "jax", "flax", "transformers", "torch"),
-        requirements=("openpi",),
-        checkouts=("OPENPI_SRC",),
-        deployment="pi05",
-        page="pi0#openpi",
-    ),
-    "openvla": RegistryEntry(
-        "vlagents_ray.policies.openvla.policy:OpenVLA",
-        "OpenVLA",
-        needs=("prismatic", "transformers", "torch", "timm"),
-        requirements=("openvla",),
-        checkouts=("OPENVLA_SRC", "OPENVLA_OFT_SRC"),
-    ),
-    "openvla_oft": RegistryEntry(
-        "vlagents_ray.policies.openvla.oft:OpenVLAOFT",
-        "OpenVLA-OFT",
-        needs=("prismatic", "transformers", "torch", "timm"),
-        requirements=("openvla",),
-        checkouts=("OPENVLA_OFT_SRC", "OPENVLA_SRC"),
-        page="openvla",
-    ),
-    "octo": RegistryEntry(
-        "vlagents_ray.policies.octo:Octo",
-        "Octo small and base 1.5, language or goal image",
-        needs=("octo", "jax", "flax", "transformers"),
-        requirements=("octo",),
-        checkouts=("OCTO_SRC",),
-        page="other#octo",
-    ),
-    "diffusion_policy": RegistryEntry(
-        "vlagents_ray.policies.diffusion_policy:DiffusionPolicy",
-        "Stanford's Diffusion Policy, trusted files only",
-        needs=("diffusion_policy", "torch", "diffusers", "dill", "omegaconf"),
-        requirements=("diffusion_policy",),
-        checkouts=("DIFFUSION_POLICY_SRC",),
-        page="other#diffusion-policy",
-    ),
-    "vjepa2_ac": RegistryEntry(
-        "vlagents_ray.policies.vjepa2_ac:VJepa2Ac",
-        "V-JEPA 2-AC, planning to a goal image",
-        needs=("src", "transformers", "torch", "timm"),
-        requirements=("hf",),
-        checkouts=("VJEPA2_SRC",),
-        page="other#v-jepa-2-ac",
-    ),
-    "onnx": RegistryEntry(
-        "vlagents_ray.policies.onnx:Onnx",
-        "any exported policy, an ONNX file or a TorchScript archive; recurrent ones too",
-        needs=("onnxruntime",),
-        extra="onnx",
-        wants="`'.[onnx]'`",
-    ),
     "reference": RegistryEntry(
         "vlagents_ray.policies.reference:Reference",
         "the reference policy: 4 million parameters, two cameras and words; trained on two cores",
@@ -230,8 +154,9 @@ _EXTRAS: dict[str, tuple[str, ...]] = {
     "rerun": ("rerun",),
 }
 
-# import name -> how to install a package that is in no extra and no file of requirements/
+# import name -> how to install a package that is in no extra and no requirements of an installed plug-in
 _ELSEWHERE = {
+    "torch": "run `pip install torch` in the policy's environment",
     "torchao": "run `pip install torchao` in the policy's environment; its requirements file leaves it out",
 }
 # packages installed as dependencies of those of the families

@@ -16,8 +16,8 @@ from benchmarks.checkpoints.tokenizer import SPECIAL, byte_level, fast_tokenizer
 from benchmarks.checkpoints.weights import parameters_on_meta, write_weights
 from vlagents_ray.errors import ConfigError
 from vlagents_ray.policies.base.accelerator import ensure_torchvision
-from vlagents_ray.policies.lerobot.checkpoint import require_served
 from vlagents_ray.registry import require
+from vlagents_ray_models.lerobot.checkpoint import require_served
 
 JOINTS = 6  # an SO-100
 _IMAGE_TOKENS = ("<image>", "<fake_token_around_image>", "<global-img>", "<end_of_utterance>")

@@ -14,8 +14,8 @@ from benchmarks.checkpoints.recipe import Recipe, WrittenCheckpoint
 from benchmarks.checkpoints.tokenizer import byte_level, fast_tokenizer
 from benchmarks.checkpoints.weights import parameters_on_meta, write_weights
 from vlagents_ray.policies.base.accelerator import ensure_torchvision
-from vlagents_ray.policies.openvla.prismatic import FILE, find_source, model_classes
 from vlagents_ray.registry import require
+from vlagents_ray_models.openvla.prismatic import FILE, find_source, model_classes
 
 ACTION_DIM, PROPRIO_DIM = 7, 8
 VOCABULARY = 32064  # Llama's 32000 and one for padding, in multiples of 64: action tokens count from its end

@@ -16,7 +16,8 @@ import typer
 ROOT = Path(__file__).resolve().parents[2]
 PYTHON = "3.12"
 # What `benchmarks.gpu` imports of the repository besides itself; `run.sh` installs their wheels.
-PROJECTS = [str(ROOT / folder) for folder in (".", "plugins/vlagents_ray_cluster", "plugins/vlagents_ray_learn")]
+PLUGINS = ("cluster", "learn", "models")
+PROJECTS = [str(ROOT), *(str(ROOT / f"plugins/vlagents_ray_{name}") for name in PLUGINS)]
 MOST_MIB = 55.0  # beside the repository's own files, such a folder still fits into an upload of 64 MiB
 PACKAGES = (
     "transformers==5.23.*", "pydantic", "simplejpeg", "websockets", "starlette", "uvicorn", "python-multipart",
@@ -24,7 +25,7 @@ PACKAGES = (
 )  # fmt: skip
 THERE = ("numpy", "torch", "hf_xet")  # with torch; hf_xet only serves downloads
 PLATFORMS = ("manylinux_2_28", "manylinux_2_27", "manylinux_2_24", "manylinux_2_17", "manylinux2014", "manylinux1")
-FOLDERS = ("vlagents_ray", "benchmarks", "requirements", "pyproject.toml", "tests/conftest.py", "tests/__init__.py",
+FOLDERS = ("vlagents_ray", "benchmarks", "requirements", "pyproject.toml", "conftest.py", "tests/__init__.py",
            "tests/support", "tests/policies/compilation", "plugins/vlagents_ray_learn/tests")  # fmt: skip
 RUN = """#!/bin/bash
 # Measures all that needs a GPU: bash run.sh [OPTIONS of python -m benchmarks.gpu]. The report is in $OUT or build/gpu.

@@ -364,7 +364,7 @@ def served(lab: Lab) -> None:
 def learning(lab: Lab) -> None:
     """Samples, plans that continue, and log-probabilities in bfloat16 against those that a float32 learner computes."""
     from vlagents_ray.policies.flow import logprob_of_chain
-    from vlagents_ray.policies.pi0 import flow_velocity
+    from vlagents_ray_models.pi0 import flow_velocity
 
     torch, count = require("torch"), lab.size(8, 2)
     server, learner = (build_agent("pi0", lab.settings(dtype=dtype, noise_level=0.5, max_rows=1 + count))

@@ -16,7 +16,7 @@ from vlagents_ray.cli import console, listing
 from vlagents_ray.cli.console import PlainConsole, table
 from vlagents_ray.cli.main import app, envs, policies
 from vlagents_ray.envs.tabletop import Tabletop
-from vlagents_ray.registry import POLICIES, names
+from vlagents_ray.registry import entries, names
 
 CLI = Path(console.__file__).parent
 CURE = "pip install 'vlagents-ray[libero]' [/] \\[red] and /a/very/long/path/" + "of-an-interpreter/" * 8 + "bin/python"
@@ -101,13 +101,13 @@ def test_what_installs_the_rest_is_said_once_for_all_that_want_it(
     policies()
     rest = shown.getvalue().partition("\n\n")[2].splitlines()
     assert rest[0] == "for the rest, whose Python a deployment names as `environment`:"
-    of_hf = sorted(name for name, one in POLICIES.items() if one.requirements[:1] == ("hf",))
+    of_hf = sorted(name for name, one in entries("policies").items() if one.requirements[:1] == ("hf",))
     assert {"pi0", "vjepa2_ac"} <= set(of_hf)
     assert f"  vlagents-ray env make requirements/hf.txt  # {', '.join(of_hf)}" in rest
     assert "  vlagents-ray env make requirements/openvla.txt  # openvla, openvla_oft" in rest
     assert "  export VJEPA2_SRC=FOLDER  # a checkout, for vjepa2_ac" in rest
     assert not any("OPENVLA" in line for line in rest)
-    assert "  onnx: not in this environment (onnxruntime): pip install 'vlagents-ray[onnx]'" in rest
+    assert "  onnx: not in this environment (onnxruntime): pip install 'vlagents-ray-models[onnx]'" in rest
 
 
 def test_of_one_policy_all_is_said(shown: io.StringIO, monkeypatch: pytest.MonkeyPatch) -> None:

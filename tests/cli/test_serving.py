@@ -18,7 +18,7 @@ from vlagents_ray.cli import ray_session
 from vlagents_ray.cli.ray_session import quiet_ray
 from vlagents_ray.cli.serve import connection_lines
 from vlagents_ray.errors import ConfigError
-from vlagents_ray.registry import POLICIES, policy_class
+from vlagents_ray.registry import POLICIES, names, policy_class
 from vlagents_ray.serve.launch import deployment_file
 from vlagents_ray.serve.launch.deployment_file import deployment, own_settings, read_deployment, with_gateways_at
 from vlagents_ray.serve.ports import EVERYWHERE
@@ -175,7 +175,7 @@ def test_the_page_of_a_server_with_keys_is_asked_for_with_one(tmp_path: Path) ->
 
 
 def _needing_settings() -> list[str]:
-    configs = {name: getattr(policy_class(name).Config, "model_fields", {}) for name in POLICIES}
+    configs = {name: getattr(policy_class(name).Config, "model_fields", {}) for name in names("policies")}
     return [name for name, fields in configs.items() if any(field.is_required() for field in fields.values())]
 
 

@@ -16,7 +16,7 @@ from typer.testing import CliRunner
 from vlagents_ray.cli import policies
 from vlagents_ray.cli.main import app
 from vlagents_ray.client.transports import base
-from vlagents_ray.registry import POLICIES
+from vlagents_ray.registry import POLICIES, entries
 from vlagents_ray.serve.ports import free_port
 
 ROOT = Path(__file__).parents[2]
@@ -167,7 +167,7 @@ def test_a_family_whose_packages_are_missing_is_said_before_anything_starts_or_i
     folder: Path, monkeypatch: pytest.MonkeyPatch, words: tuple[str, ...]
 ) -> None:
     monkeypatch.chdir(folder)
-    monkeypatch.setitem(POLICIES, "lerobot", replace(POLICIES["lerobot"], needs=("no_such_package",)))
+    monkeypatch.setitem(POLICIES, "lerobot", replace(entries("policies")["lerobot"], needs=("no_such_package",)))
     monkeypatch.setattr(
         "vlagents_ray.serve.launch.server.running_server", lambda *_, **__: pytest.fail("a server was started")
     )

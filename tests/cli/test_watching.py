@@ -21,7 +21,7 @@ from vlagents_ray.evaluate.plan.jobs import plan
 from vlagents_ray.evaluate.results.store import Store
 from vlagents_ray.evaluate.results.summary import summarize
 from vlagents_ray.policies.base import ModelConfig
-from vlagents_ray.registry import POLICIES, policy_class
+from vlagents_ray.registry import names, policy_class
 from vlagents_ray.serve.launch.deployment_file import IMPORT_PATH, own_settings, read_deployment
 
 SWEPT = {"name": "swept", "url": "http://127.0.0.1:9", "checkpoint": "/runs/{step}"}
@@ -75,7 +75,7 @@ def test_an_episode_lost_in_any_round_ends_watching_with_status_1_and_no_round_e
 
 
 FAMILIES = sorted(
-    name for name in POLICIES if issubclass(getattr(policy_class(name), "Config", None) or object, ModelConfig)
+    name for name in names("policies") if issubclass(getattr(policy_class(name), "Config", None) or object, ModelConfig)
 )
 
 

@@ -30,6 +30,7 @@ from vlagents_ray.serve.launch.server import Server, running_server
 pytestmark = pytest.mark.integration
 
 ROOT = Path(__file__).parents[2]
+TESTS = "plugins.vlagents_ray_models.tests.families"
 ENVIRONMENTS = os.environ.get("VLAGENTS_RAY_ENVIRONMENTS") or sys.prefix  # with -NAME after it
 
 
@@ -39,7 +40,7 @@ class Family:
 
     file: str  # in deployments/
     environment: str
-    tests: str  # the folder in tests/families whose tiny.py makes the checkpoint
+    tests: str  # the folder in the families' tests whose tiny.py makes the checkpoint
     kind: tuple[str, ...] = ()
     within: str = ""  # where in what tiny.py wrote
     config: dict[str, Any] = field(default_factory=dict)
@@ -59,7 +60,7 @@ FAMILIES = {
         "openpi",
         "openpi",
         ("pi05",),
-        config={"config": "tests.families.openpi.tiny:PI05", "batch_sizes": [1, 2], "steps": 4},
+        config={"config": f"{TESTS}.openpi.tiny:PI05", "batch_sizes": [1, 2], "steps": 4},
         env_vars={"OPENPI_DATA_HOME": "{}/cache", "PYTHONPATH": str(ROOT)},
         source="OPENPI_SRC",
     ),
@@ -100,7 +101,7 @@ def application(name: str, family: Family, home: Path) -> dict[str, Any]:
     """The file's one application, with a tiny checkpoint and this run's environment in it."""
     python = python_of(family)
     assert python.is_file(), f"{python} is missing: make families FAMILIES={family.environment}"
-    script = ROOT / "tests" / "families" / family.tests / "tiny.py"
+    script = ROOT.joinpath(*TESTS.split("."), family.tests, "tiny.py")
     subprocess.run(
         [python, script, home / name, *family.kind],
         check=True,

@@ -8,7 +8,7 @@ from vlagents_ray.envs import make_env
 from vlagents_ray.errors import ConfigError
 from vlagents_ray.policies.base import ModelPolicy
 from vlagents_ray.policies.scripted import Scripted
-from vlagents_ray.registry import POLICIES, names, policy_class
+from vlagents_ray.registry import entries, names, policy_class
 from vlagents_ray.testing import check_agent, check_env
 
 # Registered names whose own test modules run the suites, because they need a simulator or a setting.
@@ -20,6 +20,7 @@ VARIANTS = {  # of envs that are not tried by their own name alone
     "gymnasium": ["gymnasium/Pendulum-v1", "gymnasium/gym_pusht/PushT-v0"],
     "pusht": ["pusht", "pusht/keypoints"],
 }
+POLICIES = entries("policies")
 SIMULATED = {"gymnasium", "pusht"}
 
 
@@ -39,12 +40,12 @@ def test_every_registered_env_passes(suite: str) -> None:
     "name",
     [
         pytest.param(name, marks=pytest.mark.torch) if POLICIES[name].wants == "torch" else name
-        for name in sorted(set(names("policies")) - CHECKED_ELSEWHERE)
+        for name in sorted(POLICIES.keys() - CHECKED_ELSEWHERE)
     ],
 )
 def test_every_registered_policy_passes(name: str) -> None:
     cls = policy_class(name)
-    if issubclass(cls, ModelPolicy) and cls.Config.model_fields["checkpoint"].is_required():  # see tests/families
+    if issubclass(cls, ModelPolicy) and cls.Config.model_fields["checkpoint"].is_required():  # their own tests do
         with pytest.raises(ConfigError, match="checkpoint"):
             cls.from_config({})
         return

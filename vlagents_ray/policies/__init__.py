@@ -1,4 +1,1 @@
-"""Policies: one file or folder for each model family.
-
-`vlagents_ray.registry.POLICIES` maps their names to the classes.
-"""
+"""Policies, and what model families share; `vlagents_ray.registry` maps the names to the classes."""

@@ -1,0 +1,93 @@
+"""Checkpoints and sessions for LeRobot's tests."""
+
+from __future__ import annotations
+
+import functools
+import importlib.util
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from lerobot.policies.pi05.configuration_pi05 import PI05Config
+
+from plugins.vlagents_ray_models.tests.families.lerobot import tiny
+from vlagents_ray import Obs
+from vlagents_ray.serve.models.agent_copies import AgentCopies
+from vlagents_ray_models.lerobot import LeRobot
+from vlagents_ray_models.lerobot.kinds import LONGEST_PREFIX
+
+torch.set_num_threads(1)  # the models are too small for more: threads would wait for one another
+# LeRobot 0.4 runs pi0 and pi0.5 only with a transformers that has openpi's changes, such as this module.
+PATCHED = tiny.NEW or importlib.util.find_spec("transformers.models.siglip.check") is not None
+LEFT_OUT: dict[str, str] = {}  # why a file is not run here, for the family's page
+if tiny.NEW:
+    of_both = ("adapters", "hilserl", "learning", "pi_recipe", "plugins", "recipe")
+    LEFT_OUT |= dict.fromkeys(
+        (f"test_{name}.py" for name in of_both), "the code is that of the other version, with which it is tried"
+    )
+else:
+    LEFT_OUT |= {"test_rollout.py": "LeRobot 0.4 has no lerobot-rollout"}
+if not PATCHED:
+    LEFT_OUT |= dict.fromkeys(("test_pi.py", "test_pi_recipe.py"), "transformers is without openpi's changes")
+if not hasattr(PI05Config, LONGEST_PREFIX):
+    LEFT_OUT["test_prefixes.py"] = "the newest release of LeRobot, 0.6.1, gives π0.5 no prefixes"
+if importlib.util.find_spec("ray") is None:
+    of_ray = (
+        "test_async_client.py",
+        "test_commands.py",
+        "test_datasets.py",
+        "test_hilserl.py",
+        "test_training.py",
+    )
+    LEFT_OUT |= dict.fromkeys(of_ray, "no Ray here, as its Python is another")
+collect_ignore = list(LEFT_OUT)
+
+Load = Callable[..., LeRobot]
+Made = Callable[[str], Path]
+# LeRobot 0.4.4's VQ-BeT decorates with an autocast that torch has another name for.
+FILTERS = [pytest.mark.filterwarnings("ignore:`torch.cuda.amp.autocast:FutureWarning")]
+TASKS = ("pick up the cube", "open the drawer, then close it again", "push")
+
+
+@pytest.fixture(scope="session")
+def made(tmp_path_factory: pytest.TempPathFactory) -> Made:
+    """The checkpoint of a kind, written once."""
+
+    @functools.cache
+    def make(kind: str) -> Path:
+        return tiny.make(tmp_path_factory.mktemp(kind), kind)
+
+    return make
+
+
+@pytest.fixture(scope="session")
+def loaded(made: Made) -> Load:
+    """A policy on the checkpoint of a kind, loaded once for each setting."""
+
+    @functools.cache
+    def load(kind: str, **config: Any) -> LeRobot:
+        policy = LeRobot.from_config({"checkpoint": str(made(kind)), **config})
+        policy.initialize()
+        return policy
+
+    return load
+
+
+def view(seed: int = 0, side: int = tiny.SIDE, **info: Any) -> Obs:
+    """What one robot sees."""
+    rng = np.random.default_rng(seed)
+    image = rng.integers(0, 256, (side, side, 3), dtype=np.uint8)
+    return Obs(
+        cameras={tiny.CAMERA: image}, state={"joints": rng.uniform(-1, 1, tiny.STATE).astype(np.float32)}, info=info
+    )
+
+
+def begun(policy: LeRobot, number: int = 0) -> LeRobot:
+    """The session of one robot, as a server makes it."""
+    session = AgentCopies(policy).make()
+    session.reset(view(number), TASKS[number % len(TASKS)], seed=number)
+    assert isinstance(session, LeRobot)
+    return session

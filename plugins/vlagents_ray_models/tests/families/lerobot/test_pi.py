@@ -1,0 +1,332 @@
+"""π0, π0.5 and π0-FAST, where transformers has openpi's changes; conftest.py leaves this file out where it has not.
+
+LeRobot makes these models in two sizes only, so their sizes are changed under its hands.
+"""
+
+from __future__ import annotations
+
+import importlib
+import json
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from counting_compiler import counting_compiler
+from lerobot.policies.rtc.configuration_rtc import RTCConfig
+from normal_steps import logprob_of_steps
+from safetensors.torch import load_file, save_file
+
+from benchmarks.checkpoints.lerobot import local_tokenizer
+from benchmarks.checkpoints.tokenizer import fast_tokenizer
+from plugins.vlagents_ray_models.tests.families.lerobot import tiny
+from plugins.vlagents_ray_models.tests.families.lerobot.conftest import TASKS, begun, view
+from plugins.vlagents_ray_models.tests.families.lerobot.test_upstream import Theirs, draws_of
+from vlagents_ray.errors import ConfigError
+from vlagents_ray.interface import BEHAVIOUR, DELAY, DISTRIBUTION, LEFTOVER, SAMPLES, WANT, Act
+from vlagents_ray.testing import check_agent
+from vlagents_ray_models.lerobot import LeRobot
+
+KINDS, FAST = ("pi0", "pi05"), "pi0_fast"
+# Code of an action tokenizer, as those on the hub have it, but without a vocabulary.
+ACTION_TOKENIZER = """
+class Characters:
+    scale, min_token = 16, -32
+    bpe_tokenizer = property(lambda self: self)
+
+    @classmethod
+    def from_pretrained(cls, *_, **__):
+        return cls()
+
+    @classmethod
+    def register_for_auto_class(cls, *_): ...
+
+    def decode(self, tokens):
+        return "".join(chr(int(token) % 64) for token in tokens)
+"""
+ATOL = 1e-5
+VOCABULARY = len(fast_tokenizer())  # π0-FAST turns each of its tokens into a word
+
+
+@pytest.fixture(scope="module")
+def shrunk() -> Iterator[pytest.MonkeyPatch]:
+    """LeRobot makes small models."""
+    with pytest.MonkeyPatch.context() as patch:
+        for kind in (*KINDS, FAST):
+            modeling = importlib.import_module(f"lerobot.policies.{kind}.modeling_{kind}")
+            size = modeling.GemmaConfig(width=32, depth=2, mlp_dim=64, num_heads=4, num_kv_heads=1, head_dim=16)
+            patch.setattr(modeling, "get_gemma_config", lambda _, size=size: size)
+            new = ("PaliGemmaForConditionalGenerationWithPiGemma", "PiGemmaForCausalLM")
+            names = new if tiny.NEW else ("PaliGemmaForConditionalGeneration", "GemmaForCausalLM")
+            for name, change in zip(names, (_small_vision, _few_words), strict=True):
+                if not hasattr(modeling, name):  # π0-FAST has no second network
+                    continue
+                made = getattr(modeling, name)
+                patch.setattr(modeling, name, lambda config, made=made, change=change: made(config=change(config)))
+        yield patch
+
+
+@pytest.fixture(scope="module")
+def made(shrunk: pytest.MonkeyPatch, tmp_path_factory: pytest.TempPathFactory) -> Callable[[str], Path]:
+    """The checkpoint of a kind, with a tokenizer beside it."""
+    folder = tmp_path_factory.mktemp("pi")
+    fast_tokenizer().save_pretrained(folder / "tokenizer")
+    for kind in KINDS:
+        chunk = {"chunk_size": tiny.CHUNK, "n_action_steps": tiny.EXECUTED, "num_inference_steps": 3}
+        (folder / kind).mkdir()
+        with local_tokenizer(kind, folder / "tokenizer"):
+            tiny.write(folder / kind, tiny.config_of(kind, dtype="float32", image_resolution=(56, 56), **chunk))
+    if tiny.NEW:
+        _write_fast(folder)
+    return lambda kind: folder / kind
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_keeps_the_contract(kind: str, made: Callable[[str], Path]) -> None:
+    check_agent(LeRobot.from_config({"checkpoint": str(made(kind))}), instructions=TASKS, atol=ATOL)
+
+
+@pytest.mark.verifies("batches")
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_session_gets_the_same_in_any_company(kind: str, made: Callable[[str], Path]) -> None:
+    policy = _loaded(made(kind))
+    alone = begun(policy, 1).act(view(1)).action
+    for size in (2, 3, 8):
+        numbers = range(1, size + 1)
+        acts = policy.act_batch([view(number) for number in numbers], [begun(policy, number) for number in numbers])
+        assert isinstance(acts[0], Act)
+        np.testing.assert_allclose(acts[0].action, alone, atol=ATOL)
+
+
+@pytest.mark.verifies("parity")
+@pytest.mark.parametrize("delay", [None, 2])
+@pytest.mark.parametrize("kind", KINDS)
+def test_flow_matching_and_its_guidance_are_theirs(kind: str, delay: int | None, made: Callable[[str], Path]) -> None:
+    policy, theirs = _loaded(made(kind), execute=tiny.CHUNK), Theirs(made(kind))
+    shape = (1, tiny.CHUNK, theirs.policy.config.max_action_dim)
+    given: dict[str, Any] = {"noise": torch.from_numpy(draws_of(policy).standard_normal(shape, dtype=np.float32))}
+    info: dict[str, Any] = {}
+    if delay is not None:
+        plan = np.random.default_rng(5).uniform(-1, 1, (5, tiny.ACTION)).astype(np.float32)
+        info = {LEFTOVER: plan, DELAY: delay}
+        theirs.policy.config.rtc_config = RTCConfig(enabled=True)
+        theirs.policy.init_rtc_processor()
+        left = _normalised(plan, theirs.policy.config.normalization_mapping["ACTION"].name)
+        given |= {"prev_chunk_left_over": torch.from_numpy(left)[None], "inference_delay": delay}
+    chunk = theirs.policy.predict_action_chunk(theirs.see(view()), **given)
+    ours = begun(policy).act(view(**info)).action
+    np.testing.assert_allclose(ours, theirs.after(chunk)[0].detach().numpy(), atol=1e-4)
+
+
+@pytest.mark.skipif(not tiny.NEW, reason="LeRobot 0.4 has no relative actions")
+@pytest.mark.verifies("parity")
+def test_actions_relative_to_the_state_and_their_leftovers_are_theirs(
+    made: Callable[[str], Path], tmp_path: Path
+) -> None:
+    from lerobot.policies.rtc.relative import reanchor_relative_rtc_prefix
+
+    chunk = {"chunk_size": tiny.CHUNK, "n_action_steps": tiny.EXECUTED, "num_inference_steps": 3}
+    with local_tokenizer("pi0", made("pi0").parent / "tokenizer"):
+        sizes = {"dtype": "float32", "image_resolution": (56, 56)}
+        tiny.write(tmp_path, tiny.config_of("pi0", use_relative_actions=True, **sizes, **chunk))
+    policy, theirs = _loaded(tmp_path, execute=tiny.CHUNK), Theirs(tmp_path)
+    views = [view(1, **{SAMPLES: 2}), view(2)]
+    both = policy.act_batch(views, [begun(policy, 1), begun(policy, 2)])
+    for number, act in zip((1, 2), both, strict=True):
+        assert isinstance(act, Act)
+        np.testing.assert_allclose(act.action, begun(policy, number).act(view(number)).action, atol=ATOL)
+
+    plan = np.random.default_rng(5).uniform(-1, 1, (5, tiny.ACTION)).astype(np.float32)
+    theirs.policy.config.rtc_config = RTCConfig(enabled=True)
+    theirs.policy.init_rtc_processor()
+    seen = theirs.see(view())
+    steps = {type(step).__name__: step for step in theirs.before.steps}
+    left = reanchor_relative_rtc_prefix(
+        torch.from_numpy(plan),
+        torch.from_numpy(view().state["joints"]),
+        steps["RelativeActionsProcessorStep"],
+        steps["NormalizerProcessorStep"],
+        "cpu",
+    )
+    shape = (1, tiny.CHUNK, theirs.policy.config.max_action_dim)
+    noise = torch.from_numpy(draws_of(policy).standard_normal(shape, dtype=np.float32))
+    given = {"noise": noise, "prev_chunk_left_over": left[None], "inference_delay": 2}
+    wanted = theirs.after(theirs.policy.predict_action_chunk(seen, **given))[0].detach().numpy()
+    ours = begun(policy).act(view(**{LEFTOVER: plan, DELAY: 2})).action
+    np.testing.assert_allclose(ours, wanted, atol=1e-4)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_random_steps_have_the_log_probability_of_the_networks_own_steps(
+    kind: str, made: Callable[[str], Path], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    policy = _loaded(made(kind), noise_level=0.5)
+    network = policy.model.kind.policy.model
+    read: list[int] = []
+    alone: dict[str, Any] = {}
+    embed, step = network.embed_prefix, network.denoise_step
+
+    def counted(images: Any, *rest: Any) -> Any:
+        read.append(len(images[0]))
+        return embed(images, *rest)
+
+    def kept(**inputs: Any) -> Any:
+        alone.update(inputs)
+        return step(**inputs)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(network, "denoise_step", kept)
+        begun(policy, 1).act(view(1))
+    monkeypatch.setattr(network, "embed_prefix", counted)
+    act = begun(policy, 1).act(view(1, **{WANT: ["logprob", "replay"], SAMPLES: 2}))
+    assert read == [1]
+
+    def velocity(noisy: Any, time: float) -> Any:
+        with torch.inference_mode():
+            return step(**alone | {"x_t": noisy, "timestep": torch.tensor([time], dtype=torch.float32)})
+
+    own, found = act.info[BEHAVIOUR], act.info[DISTRIBUTION]
+    chains = [own["replay"]["chain"], *found["replay"]["chain"]]
+    for chain, logprob in zip(chains, [own["logprob"], *found["logprob"]], strict=True):
+        total = logprob_of_steps(velocity, chain, 0.5)[: len(act.action), : tiny.ACTION]
+        np.testing.assert_allclose(logprob, total, atol=5e-3)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_compiled_passes_act_as_without(kind: str, made: Callable[[str], Path]) -> None:
+    plain = _loaded(made(kind))
+    with counting_compiler() as programs:
+        compiled = _loaded(made(kind), compile="require", batch_sizes=[2])
+        assert programs.rows == [2, 2]  # what is seen, and a step of the flow
+        for size in (1, 2, 3):
+            views = [view(i) for i in range(size)]
+            found = [policy.act_batch(views, [begun(policy, i) for i in range(size)]) for policy in (plain, compiled)]
+            for one, other in zip(*found, strict=True):
+                assert isinstance(one, Act)
+                assert isinstance(other, Act)
+                np.testing.assert_allclose(one.action, other.action, atol=ATOL)
+        assert programs.rows == [2, 2]
+
+
+OF_FAST = pytest.mark.skipif(not tiny.NEW, reason="π0-FAST is tried with LeRobot 0.6 alone")
+
+
+def settings_of_fast(made: Callable[[str], Path]) -> dict[str, Any]:
+    """Of the checkpoint of π0-FAST; LeRobot does not save the name of its action tokenizer's text tokenizer."""
+    step = {"paligemma_tokenizer_name": str(made(FAST).parent / "tokenizer")}
+    return {"trust_remote_code": True, "processors": {"action_tokenizer_processor": step}}
+
+
+@OF_FAST
+@pytest.mark.verifies("parity")
+def test_tokens_drawn_from_the_same_seed_are_theirs(made: Callable[[str], Path]) -> None:
+    policy, theirs = (
+        _loaded(made(FAST), **settings_of_fast(made)),
+        Theirs(made(FAST), **settings_of_fast(made)["processors"]),
+    )
+    rows = begun(policy).act(view()).action
+    assert len(rows) == tiny.EXECUTED
+    torch.manual_seed(int(draws_of(policy).integers(2**63)))
+    for row in rows:
+        np.testing.assert_allclose(theirs.select(view()), row, atol=ATOL)
+
+
+@OF_FAST
+def test_pi0_fast_keeps_the_contract(made: Callable[[str], Path]) -> None:
+    fast = LeRobot.from_config({"checkpoint": str(made(FAST)), **settings_of_fast(made)})
+    check_agent(fast, instructions=TASKS, atol=ATOL)
+
+
+@OF_FAST
+@pytest.mark.verifies("isolation")
+def test_tokens_that_are_no_actions_fail_their_own_session(
+    made: Callable[[str], Path], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    policy = _loaded(made(FAST), **settings_of_fast(made))
+    alone = begun(policy, 2).act(view(2)).action
+    network, read = policy.model.kind.policy, list[int]()
+    decode = network.detokenize_actions
+
+    def checked(*tokens: Any, **shape: Any) -> Any:
+        read.append(1)
+        network.config.validate_action_token_prefix = len(read) == 1  # those of the first row, which are random
+        return decode(*tokens, **shape)
+
+    monkeypatch.setattr(network, "detokenize_actions", checked)
+    broken, whole = policy.act_batch([view(1), view(2)], [begun(policy, 1), begun(policy, 2)])
+    assert isinstance(broken, Exception)
+    assert isinstance(whole, Act)
+    np.testing.assert_allclose(whole.action, alone, atol=ATOL)
+
+
+@OF_FAST
+@pytest.mark.verifies("loading")
+def test_the_code_of_an_action_tokenizer_wants_trust(made: Callable[[str], Path]) -> None:
+    with pytest.raises(ConfigError, match="trust_remote_code: true"):
+        _loaded(made(FAST))
+
+
+@pytest.mark.verifies("loading")
+@pytest.mark.parametrize("kind", KINDS)
+def test_weights_that_lerobot_would_replace_by_random_ones_are_an_error(kind: str, made: Callable[[str], Path]) -> None:
+    file = made(kind) / "model.safetensors"
+    whole = load_file(file)
+    try:
+        save_file({name: tensor for name, tensor in whole.items() if "action_out_proj" not in name}, file)
+        with pytest.raises(ConfigError, match="action_out_proj"):
+            _loaded(made(kind))
+        file.write_bytes(b"not a checkpoint")
+        with pytest.raises(ConfigError, match="is it complete"):
+            _loaded(made(kind))
+        save_file({name.removeprefix("model."): tensor for name, tensor in whole.items()}, file)  # as openpi names them
+        _loaded(made(kind))
+    finally:
+        save_file(whole, file)
+
+
+def _write_fast(folder: Path) -> None:
+    """A checkpoint of π0-FAST in a folder with a tokenizer, and the code of an action tokenizer beside it."""
+    code = folder / "actions"
+    code.mkdir()
+    (code / "characters.py").write_text(ACTION_TOKENIZER)
+    named = {"processor_class": "Characters", "auto_map": {"AutoProcessor": "characters.Characters"}}
+    (code / "processor_config.json").write_text(json.dumps(named))
+    names = {"text_tokenizer_name": str(folder / "tokenizer"), "action_tokenizer_name": str(code)}
+    tokens = {
+        "max_decoding_steps": 16,
+        "fast_skip_tokens": 0,
+        "temperature": 1.0,
+        "validate_action_token_prefix": False,
+    }
+    sizes = {"dtype": "float32", "n_action_steps": tiny.EXECUTED}  # images of 224 pixels, as it has no other
+    (folder / FAST).mkdir()
+    tiny.write(folder / FAST, tiny.config_of(FAST, chunk_size=tiny.CHUNK, **names, **tokens, **sizes))
+
+
+def _loaded(folder: Path, **config: Any) -> LeRobot:
+    policy = LeRobot.from_config({"checkpoint": str(folder), **config})
+    policy.initialize()
+    return policy
+
+
+def _normalised(plan: np.ndarray, mode: str) -> np.ndarray:
+    of = tiny.statistics()["action"]
+    if mode == "MEAN_STD":
+        return (plan - of["mean"]) / of["std"]
+    return 2 * (plan - of["q01"]) / (of["q99"] - of["q01"]) - 1
+
+
+def _small_vision(config: Any) -> Any:
+    for key, value in {"num_hidden_layers": 1, "hidden_size": 32, "num_attention_heads": 2}.items():
+        setattr(config.vision_config, key, value)
+    config.vision_config.intermediate_size = 64
+    config.vision_config.projection_dim = config.text_config.hidden_size
+    _few_words(config.text_config)
+    return config
+
+
+def _few_words(config: Any) -> Any:
+    config.vocab_size = VOCABULARY
+    return config

@@ -1,0 +1,186 @@
+"""Octo's own code, asked through the policy: the same actions, in any company."""
+
+from __future__ import annotations
+
+import copy
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from jax_compiles import jax_compiles
+from pushed_weights import check_pushed_weights
+
+from plugins.vlagents_ray_models.tests.families.octo.conftest import MARKS
+from vlagents_ray import Act, Obs
+from vlagents_ray.errors import InvalidObservation, MissingCamera
+from vlagents_ray.interface import DISTRIBUTION, GOAL_IMAGE, SAMPLES
+from vlagents_ray.testing import check_agent
+from vlagents_ray_models.octo import Octo
+
+pytestmark = MARKS
+
+ATOL = 1e-4  # float32 on a CPU, actions of up to 5; measured: 3e-5, as untrained weights amplify what differs
+INSTRUCTIONS = ["pick up the cube", "push the cube", "open the drawer"]
+
+
+def made(checkpoint: Path, **config: Any) -> Octo:
+    return Octo.from_config({"checkpoint": str(checkpoint), "dataset": "bridge_dataset", "batch_sizes": None, **config})
+
+
+@pytest.fixture(scope="module")
+def policy(pretrained: Path) -> Octo:
+    loaded = made(pretrained, batch_sizes=[1, 8])
+    loaded.initialize()
+    return loaded
+
+
+def seen(seed: int, size: tuple[int, int] = (48, 64), **info: Any) -> Obs:
+    rng = np.random.default_rng(seed)
+    image = lambda: rng.integers(0, 256, (*size, 3), dtype=np.uint8)  # noqa: E731 - a line, used twice
+    return Obs(cameras={"front": image(), "wrist": image()}, info=info)
+
+
+def begun(policy: Octo, obs: Obs, instruction: str | None = "push the cube", seed: int = 0) -> Octo:
+    session = copy.copy(policy)
+    session.reset(obs, instruction, seed=seed)
+    return session
+
+
+def upstream(policy: Octo, frames: list[Obs], mask: list[bool], tasks: dict[str, Any], seed: int) -> np.ndarray:
+    """What Octo's `sample_actions` gives for one robot, with the key that a session of this seed draws first."""
+    model, perceived = policy.model.model, [policy.perceive(obs) for obs in frames]
+    observations = {name: np.stack([frame[name] for frame in perceived])[None] for name in perceived[0]}
+    observations["timestep_pad_mask"] = np.array([mask])
+    key = np.random.default_rng([0, seed]).integers(2**32, size=2, dtype=np.uint32)
+    statistics = policy.model.statistics(policy.config.dataset, "action")
+    return np.asarray(model.sample_actions(observations, tasks, unnormalization_statistics=statistics, rng=key)[0])
+
+
+def test_keeps_the_contract(pretrained: Path) -> None:
+    check_agent(made(pretrained, batch_sizes=[1, 4]), atol=ATOL)
+
+
+@pytest.mark.verifies("parity")
+def test_an_instruction_gives_what_octo_gives_and_only_real_frames_count(policy: Octo) -> None:
+    first, second = seen(1), seen(2)
+    tasks = policy.model.model.create_tasks(texts=["push the cube"])
+    session = begun(policy, first, seed=5)
+    wanted = upstream(policy, [first, first], [False, True], tasks, seed=5)
+    np.testing.assert_allclose(session.act(first).action, wanted, atol=ATOL)
+
+    moved = begun(policy, first, seed=6)
+    moved.observe(first)
+    wanted = upstream(policy, [first, second], [True, True], tasks, seed=6)
+    np.testing.assert_allclose(moved.act(second).action, wanted, atol=ATOL)
+
+
+@pytest.mark.verifies("parity")
+def test_a_goal_image_gives_what_octo_gives(policy: Octo) -> None:
+    goal = seen(9).cameras["front"]
+    obs = seen(1, **{GOAL_IMAGE: goal})
+    as_seen = policy.perceive(Obs(cameras={"front": goal, "wrist": goal}))["image_primary"]
+    wanted = upstream(
+        policy, [obs, obs], [False, True], policy.model.model.create_tasks(goals={"image_primary": as_seen[None]}), 3
+    )
+    np.testing.assert_allclose(begun(policy, obs, None, seed=3).act(obs).action, wanted, atol=ATOL)
+
+
+@pytest.mark.verifies("batches")
+def test_a_session_gets_the_same_in_any_company(policy: Octo) -> None:
+    goal = seen(90).cameras["front"]
+    views = [seen(i, **({GOAL_IMAGE: goal} if i % 3 == 2 else {})) for i in range(8)]
+
+    def sessions(count: int) -> list[Octo]:
+        return [begun(policy, views[i], INSTRUCTIONS[i % 3], seed=i) for i in range(count)]
+
+    alone = [session.act(view).action for session, view in zip(sessions(8), views, strict=True)]
+    for size in (2, 3, 8):
+        company = sessions(size)
+        for i, act in enumerate(policy.act_batch(views[:size], company)):
+            np.testing.assert_allclose(act.action, alone[i], atol=ATOL)
+    assert np.ptp(np.stack(alone), axis=0).mean() > 100 * ATOL  # eight answers, not one
+
+
+def test_samples_are_draws_of_their_own(policy: Octo) -> None:
+    plain, asked = begun(policy, seen(1)), begun(policy, seen(1))
+    wanted = plain.act(seen(1)).action
+    act = asked.act(seen(1, **{SAMPLES: 10}))
+    np.testing.assert_allclose(act.action, wanted, atol=ATOL)
+    found = act.info[DISTRIBUTION]
+    assert found["samples"].shape == (10, 4, 7)
+    assert found["std"].mean() > 100 * ATOL
+    np.testing.assert_allclose(found["mean"], found["samples"].mean(0), atol=ATOL)
+
+
+def test_a_camera_that_is_left_out_has_no_tokens_as_in_octo(pretrained: Path) -> None:
+    policy = made(pretrained, cameras={"image_primary": "front"})
+    policy.initialize()
+    obs = Obs(cameras={"front": seen(1).cameras["front"]})
+    tasks = policy.model.model.create_tasks(texts=["push the cube"])
+    wanted = upstream(policy, [obs, obs], [False, True], tasks, seed=0)
+    np.testing.assert_allclose(begun(policy, obs).act(obs).action, wanted, atol=ATOL)
+
+
+def test_a_finetuned_checkpoint_reads_the_state(finetuned: Path) -> None:
+    policy = made(finetuned, dataset=None, state=["joints"])
+    policy.initialize()
+    contract = policy.contract
+    assert contract.state is not None
+    assert contract.state["joints"].dim == 3
+    assert list(contract.cameras or {}) == ["front"]
+    obs = Obs(cameras={"front": seen(1).cameras["front"]}, state={"joints": np.array([2, 1, -4], np.float32)})
+    np.testing.assert_allclose(policy.perceive(obs)["proprio"], [1, 0, -3], atol=1e-6)
+    tasks = policy.model.model.create_tasks(texts=["push the cube"])
+    wanted = upstream(policy, [obs, obs], [False, True], tasks, seed=0)
+    np.testing.assert_allclose(begun(policy, obs).act(obs).action, wanted, atol=ATOL)
+
+
+@pytest.mark.parametrize(
+    ("goal", "instruction", "info"),
+    [
+        ("either", None, {}),
+        ("image", "push the cube", {}),
+        ("language", None, {}),
+        ("language", "push the cube", {GOAL_IMAGE: np.zeros((8, 8, 3), np.uint8)}),
+        ("either", None, {GOAL_IMAGE: np.zeros((8, 8), np.uint8)}),
+    ],
+)
+def test_an_episode_without_its_kind_of_task_is_refused(
+    policy: Octo, pretrained: Path, goal: str, instruction: str | None, info: dict[str, Any]
+) -> None:
+    other = made(pretrained, goal=goal)
+    other.model = policy.model
+    with pytest.raises(InvalidObservation, match="want"):
+        other.reset(seen(1, **info), instruction)
+
+
+@pytest.mark.verifies("isolation")
+def test_a_missing_camera_fails_its_own_session_alone(policy: Octo) -> None:
+    blind = Obs(cameras={"front": np.zeros((8, 8, 3), np.uint8)})
+    bad, good = policy.act_batch([blind, seen(1)], [begun(policy, seen(0)), begun(policy, seen(1))])
+    assert isinstance(bad, MissingCamera)
+    assert not isinstance(good, Exception)
+
+
+def test_no_act_compiles_a_program(pretrained: Path) -> None:
+    policy = made(pretrained, batch_sizes=[1, 2, 4])
+    policy.initialize()
+    batches: list[list[dict[str, Any]]] = [[{}] * count for count in range(1, 7)]
+    batches += [[{SAMPLES: count}, *[{}] * others] for count in (1, 2, 3, 5) for others in range(3)]
+    with jax_compiles() as compiled:
+        for batch in batches:
+            views = [seen(i, **info) for i, info in enumerate(batch)]
+            acts = policy.act_batch(views, [begun(policy, view, seed=i) for i, view in enumerate(views)])
+            assert all(isinstance(act, Act) for act in acts)
+    assert compiled == []
+
+
+def test_it_acts_with_pushed_weights(pretrained: Path) -> None:
+    from flax.traverse_util import flatten_dict
+
+    policy = made(pretrained, batch_sizes=[1])
+    policy.initialize()
+    assert policy.parameters().keys() == flatten_dict(policy.model.model.params, sep="/").keys()  # those of OctoModel
+    obs = seen(1)
+    check_pushed_weights(policy, lambda: begun(policy, obs).act(obs).action)

@@ -1,0 +1,195 @@
+"""openpi's PyTorch port, where transformers is patched as openpi wants it; without that it is refused."""
+
+from __future__ import annotations
+
+import copy
+import importlib.util
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+import numpy as np
+import pytest
+from counting_compiler import counting_compiler
+from normal_steps import logprob_of_steps
+from pushed_weights import check_pushed_weights
+
+from plugins.vlagents_ray_models.tests.families.openpi.conftest import MARKS
+from plugins.vlagents_ray_models.tests.families.openpi.test_openpi import BATCHED, WORDS, begun, seen, theirs
+from vlagents_ray.errors import ConfigError, InvalidObservation
+from vlagents_ray.interface import BEHAVIOUR, DELAY, DISTRIBUTION, LEFTOVER, SAMPLES, WANT
+from vlagents_ray.policies.base import policy as base_policy
+from vlagents_ray_models.openpi import OpenPi, _observation
+
+pytestmark = MARKS
+PATCHED = all(importlib.util.find_spec(name) for name in ("transformers", "transformers.models.siglip.check"))
+patched = pytest.mark.skipif(
+    not PATCHED, reason="transformers is not patched by openpi's models_pytorch/transformers_replace"
+)
+
+
+@pytest.fixture(scope="module")
+def port(tiny: ModuleType, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A checkpoint of the port, small by the same means as the JAX one."""
+    return tiny.save_torch(tmp_path_factory.mktemp("torch"))
+
+
+def made(folder: Path, **settings: Any) -> OpenPi:
+    config = {
+        "checkpoint": str(folder),
+        "config": "plugins.vlagents_ray_models.tests.families.openpi.tiny:PI0",
+        "steps": 3,
+        **settings,
+    }
+    policy = OpenPi.from_config(config)
+    policy.initialize()
+    return policy
+
+
+@patched
+@pytest.mark.verifies("parity")
+def test_actions_are_those_of_openpis_own_policy_alone_and_in_company(port: Path, tiny: ModuleType) -> None:
+    import torch
+    from openpi.policies.policy import Policy
+
+    policy = made(port)
+    transforms = policy.model.transforms
+    upstream = Policy(
+        policy.model.model.trained,
+        transforms=transforms.inputs.transforms,
+        output_transforms=transforms.outputs.transforms,
+        sample_kwargs={"num_steps": 3},
+        is_pytorch=True,
+    )
+    acts = policy.act_batch([seen("pi0", i) for i in range(3)], [begun(policy, "pi0", i) for i in range(3)])
+    for i, act in enumerate(acts):
+        noise = np.random.default_rng([0, i]).standard_normal((8, 32), dtype=np.float32)
+        with torch.inference_mode():
+            want = upstream.infer({**theirs("pi0", i), "prompt": WORDS[i]}, noise=noise)["actions"]
+        np.testing.assert_allclose(act.action, want, atol=10 * BATCHED)
+
+
+@patched
+def test_compiled_passes_act_as_without(port: Path) -> None:
+    plain = made(port)
+    with counting_compiler() as programs:
+        compiled = made(port, compile="require", batch_sizes=[2])
+        assert programs.rows == [2, 2]  # what is seen, and a step of the flow
+        for size in (1, 2, 3):
+            views = [seen("pi0", i) for i in range(size)]
+            for one, other in zip(
+                *(p.act_batch(views, [begun(p, "pi0", i) for i in range(size)]) for p in (plain, compiled)), strict=True
+            ):
+                np.testing.assert_allclose(one.action, other.action, atol=BATCHED)
+        assert programs.rows == [2, 2]
+
+
+@patched
+def test_it_acts_with_pushed_weights(port: Path) -> None:
+    policy = made(port)
+    assert policy.parameters().keys() == policy.model.model.trained.state_dict().keys()  # those of openpi's trainer
+    check_pushed_weights(policy, lambda: begun(policy, "pi0", 0).act(seen("pi0", 0)).action)
+
+
+@patched
+def test_frozen_rows_come_back_as_planned(port: Path) -> None:
+    policy = made(port)
+    plan = begun(policy, "pi0", 1).act(seen("pi0", 1)).action[1:]
+    guided = begun(policy, "pi0", 0).act(seen("pi0", 0, **{LEFTOVER: plan, DELAY: 2})).action
+    np.testing.assert_allclose(guided[:2], plan[:2], atol=1e-4)
+    again = copy.copy(policy)  # what guided one call is gone with it
+    again.reset(seen("pi0", 0), WORDS[0], seed=0)
+    assert np.abs(again.act(seen("pi0", 0)).action[:2] - plan[:2]).max() > 0.01
+
+
+LEVEL = 0.5
+ALL = ["logprob", "entropy", "replay"]
+
+
+@patched
+def test_the_log_probability_is_that_of_the_network_itself(port: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    import torch
+
+    policy = made(port, noise_level=LEVEL)
+    assert policy.contract.behaviour == tuple(ALL)
+    act = begun(policy, "pi0", 0).act(seen("pi0", 0, **{WANT: ALL, SAMPLES: 2}))
+    network, seen_velocities = policy.model.model.trained, []
+    session = begun(policy, "pi0", 0)
+    inputs = session.perceive(seen("pi0", 0)).inputs
+    observation = _observation({key: _tensors(value) for key, value in inputs.items()})
+    plain = network._preprocess_observation
+    monkeypatch.setattr(network, "_preprocess_observation", lambda one, **_: plain(one, train=False))
+    hook = network.action_out_proj.register_forward_hook(lambda _module, _inputs, out: seen_velocities.append(out))
+
+    def velocity(noisy: Any, time: float) -> Any:
+        """The network's in training: noise and actions are the same, and so is what is between them."""
+        with torch.no_grad():
+            network.forward(observation, noisy, noise=noisy, time=torch.tensor([time], dtype=torch.float32))
+        return seen_velocities[-1]
+
+    own, found = act.info[BEHAVIOUR], act.info[DISTRIBUTION]
+    chains = [own["replay"]["chain"], *found["replay"]["chain"]]
+    for chain, logprob in zip(chains, [own["logprob"], *found["logprob"]], strict=True):
+        np.testing.assert_allclose(logprob, logprob_of_steps(velocity, chain, LEVEL)[:, :7], atol=5e-3)
+    hook.remove()
+
+
+def _tensors(value: Any) -> Any:
+    """Inputs of one row as a batch of one."""
+    import torch
+
+    if isinstance(value, dict):
+        return {key: _tensors(one) for key, one in value.items()}
+    return torch.from_numpy(np.array(value))[None]
+
+
+@patched
+def test_the_samples_of_an_observation_are_of_one_reading_of_it(port: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    policy, read = made(port, noise_level=LEVEL), []
+    network = policy.model.model.trained
+    embed = network.embed_prefix
+
+    def counted(images: Any, *rest: Any) -> Any:
+        read.append(len(images[0]))
+        return embed(images, *rest)
+
+    monkeypatch.setattr(network, "embed_prefix", counted)
+    views = [seen("pi0", 0), seen("pi0", 1, **{SAMPLES: 8, WANT: ALL}), seen("pi0", 2)]
+
+    def acted() -> list[Any]:
+        sessions = [begun(policy, "pi0", i) for i in range(3)]
+        sessions[0].reset(views[0], "pick up the cube " * 50)  # too long, so that it is not computed
+        return policy.act_batch(views, sessions)
+
+    shared = acted()
+    monkeypatch.setattr(base_policy, "shared_frames", lambda rows: (list(range(len(rows))),) * 2)
+    each = acted()
+    assert read == [2, 10]
+    assert isinstance(shared[0], InvalidObservation)
+    alone = begun(policy, "pi0", 1).act(views[1]).info[BEHAVIOUR]["replay"]["chain"]
+    np.testing.assert_allclose(shared[1].info[BEHAVIOUR]["replay"]["chain"], alone, atol=10 * BATCHED)
+    for one, other in zip(shared[1:], each[1:], strict=True):
+        np.testing.assert_allclose(one.action, other.action, atol=10 * BATCHED)
+    samples = [acts[1].info[DISTRIBUTION]["samples"] for acts in (shared, each)]
+    np.testing.assert_allclose(*samples, atol=10 * BATCHED)
+
+
+@patched
+@pytest.mark.verifies("loading")
+def test_a_lost_tensor_is_an_error(port: Path, tmp_path: Path, tiny: ModuleType) -> None:
+    from safetensors.torch import load_file, save_file
+
+    tensors = load_file(port / "model.safetensors")
+    del tensors["action_out_proj.bias"]
+    save_file(tensors, tmp_path / "model.safetensors")
+    tiny.save_statistics(tmp_path, "pi0")
+    with pytest.raises(ConfigError, match=r"action_out_proj\.bias"):
+        made(tmp_path)
+
+
+@pytest.mark.skipif(PATCHED, reason="transformers is patched here")
+def test_transformers_as_it_is_is_refused_with_the_cure(tmp_path: Path, tiny: ModuleType) -> None:
+    tiny.save_statistics(tmp_path, "pi0")
+    (tmp_path / "model.safetensors").touch()
+    with pytest.raises(ConfigError, match="transformers_replace"):
+        made(tmp_path)

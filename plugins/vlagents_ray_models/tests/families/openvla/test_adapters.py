@@ -1,0 +1,122 @@
+"""LoRA adapters over OpenVLA, as PEFT trains and saves them, against each one merged into its base by PEFT."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import threading
+import warnings
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from peft import LoraConfig, PeftModel, get_peft_model
+
+from plugins.vlagents_ray_models.tests.families.openvla.conftest import LIBRARIES, WORDS, seen
+from plugins.vlagents_ray_models.tests.families.openvla.upstream import module
+from vlagents_ray.errors import ConfigError
+from vlagents_ray.interface import DISTRIBUTION, POLICY, SAMPLES, Act
+from vlagents_ray.serve.models.agent_copies import AgentCopies
+from vlagents_ray.serve.weights import ModelWeights, PushOptions
+from vlagents_ray_models.openvla.policy import OpenVLA
+
+pytestmark = [pytest.mark.source("OPENVLA_SRC"), *LIBRARIES]
+
+ATOL = 1e-4  # of means of actions of size 1
+CHOSEN = ("first", None, "second", "first")
+
+
+@pytest.fixture(scope="module")
+def saved(checkpoint: Callable[[str], Path], tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
+    """Folders of adapters, and under "merged/NAME" of whole checkpoints; "second" has a dataset of its own."""
+    root, folders = tmp_path_factory.mktemp("adapters"), {}
+    cls = module("OPENVLA_SRC", "extern.hf.modeling_prismatic").OpenVLAForActionPrediction
+    for seed, (name, rank) in enumerate((("first", 4), ("second", 8))):
+        torch.manual_seed(seed)
+        network = cls.from_pretrained(checkpoint("openvla"))
+        # as OpenVLA's vla-scripts/finetune.py, but not at zero
+        config = LoraConfig(
+            r=rank, lora_alpha=min(rank, 16), lora_dropout=0.0, target_modules="all-linear", init_lora_weights=False
+        )
+        trained = get_peft_model(network, config)
+        folders[name] = root / name
+        with warnings.catch_warnings():  # that it saves the base's last layer as well, since that has an adapter
+            warnings.filterwarnings("ignore", "Setting `save_embedding_layers`", UserWarning)
+            trained.save_pretrained(folders[name])
+        whole = folders[f"merged/{name}"] = shutil.copytree(checkpoint("openvla"), root / f"merged-{name}")
+        trained.merge_and_unload().save_pretrained(whole)
+        if name == "second":
+            datasets = json.loads((whole / "dataset_statistics.json").read_text())
+            for folder in (folders[name], whole):
+                own = {"own_dataset": datasets["libero_spatial_no_noops"]}
+                (folder / "dataset_statistics.json").write_text(json.dumps(own))
+    return folders
+
+
+def load(folder: Path, **config: Any) -> OpenVLA:
+    policy = OpenVLA.from_config({"checkpoint": str(folder), "unnorm_key": "bridge_orig"} | config)
+    policy.initialize()
+    return policy
+
+
+def session(policy: OpenVLA, seed: int, **options: Any) -> OpenVLA:
+    one = AgentCopies(policy).make()
+    one.reset(seen(seed), WORDS[seed % len(WORDS)], seed=seed, **options)
+    assert isinstance(one, OpenVLA)
+    return one
+
+
+def test_each_row_of_one_pass_acts_as_its_adapter_merged_alone(
+    checkpoint: Callable[[str], Path], saved: dict[str, Path]
+) -> None:
+    adapters = {name: str(saved[name]) for name in ("first", "second")}
+    policy = load(checkpoint("openvla"), adapters=adapters)
+    alone = {
+        None: load(checkpoint("openvla")),
+        "first": load(saved["merged/first"]),
+        "second": load(saved["merged/second"], unnorm_key=None),
+    }
+    sessions = [session(policy, seed, adapter=name) for seed, name in enumerate(CHOSEN)]
+    acts = policy.act_batch([seen(seed, **{SAMPLES: 2 * seed}) for seed in range(len(CHOSEN))], sessions)
+    for seed, (name, act) in enumerate(zip(CHOSEN, acts, strict=True)):
+        wanted = session(alone[name], seed).act(seen(seed, **{SAMPLES: 2 * seed}))
+        assert isinstance(act, Act)
+        assert np.array_equal(act.action, wanted.action)  # the same tokens
+        if seed:
+            stated, other = act.info[DISTRIBUTION], wanted.info[DISTRIBUTION]
+            np.testing.assert_allclose(stated["mean"], other["mean"], atol=ATOL)
+            np.testing.assert_allclose(stated["std"], other["std"], atol=ATOL)
+            assert np.array_equal(stated["samples"], other["samples"])
+        assert (POLICY in act.info) == (name is not None)
+        if name is not None:
+            assert not np.array_equal(wanted.action, session(alone[None], seed).act(seen(seed)).action)
+
+
+def test_a_learner_pushes_the_layers_alone_that_its_adapters_change(
+    checkpoint: Callable[[str], Path], saved: dict[str, Path]
+) -> None:
+    policy, cls = load(checkpoint("openvla")), module("OPENVLA_SRC", "extern.hf.modeling_prismatic")
+    trained = PeftModel.from_pretrained(
+        cls.OpenVLAForActionPrediction.from_pretrained(checkpoint("openvla")), saved["first"]
+    )
+    trained.merge_adapter()
+    merged = {name: value for name, value in trained.state_dict().items() if name.endswith(".base_layer.weight")}
+    pushed = {name.removeprefix("base_model.model.").replace(".base_layer", ""): merged[name] for name in merged}
+    weights, options = ModelWeights(policy, threading.Lock()), PushOptions(partial=True)
+    weights.stage(1, pushed, options)
+    weights.commit(1, options, list)
+    weights.use(weights.newest)
+    acts = [session(one, 1).act(seen(1, **{SAMPLES: 2})) for one in (policy, load(saved["merged/first"]))]
+    assert np.array_equal(*(act.action for act in acts))
+    np.testing.assert_allclose(*(act.info[DISTRIBUTION]["mean"] for act in acts), atol=ATOL)
+    assert len(pushed) < len(policy.parameters())
+
+
+def test_statistics_of_another_action_are_refused(checkpoint: Callable[[str], Path], saved: dict[str, Path]) -> None:
+    folder = shutil.copytree(saved["first"], saved["first"].parent / "short")
+    (folder / "dataset_statistics.json").write_text(json.dumps({"d": {"action": {"q01": [0.0], "q99": [1.0]}}}))
+    with pytest.raises(ConfigError, match=r"adapter 'short': .*got actions of \[1\] numbers, want \[7\], as"):
+        load(checkpoint("openvla"), adapters={"short": str(folder)})

@@ -1,0 +1,66 @@
+"""Which wrong programs of π0 in bfloat16 the comparison with the eager cores refuses."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+
+from plugins.vlagents_ray_models.tests.families.pi0.conftest import made
+from vlagents_ray.policies.loading import loading_report
+
+ROWS = 4
+
+
+def scaled(core: Callable[..., Any]) -> Callable[..., Any]:
+    return lambda *tensors: 1.05 * core(*tensors)
+
+
+def without_state(core: Callable[..., Any]) -> Callable[..., Any]:
+    return lambda encoded, seen, state, actions, times: core(encoded, seen, 0 * state, actions, times)
+
+
+def at_the_next_time(core: Callable[..., Any]) -> Callable[..., Any]:
+    return lambda encoded, seen, state, actions, times: core(encoded, seen, state, actions, times - 0.1)
+
+
+def with_padding(core: Callable[..., Any]) -> Callable[..., Any]:
+    return lambda encoded, seen, *others: core(encoded, torch.ones_like(seen), *others)
+
+
+def cameras_exchanged(core: Callable[..., Any]) -> Callable[..., Any]:
+    return lambda tokens, mask, cameras, state, images: core(tokens, mask, cameras, state, images.flip(1))
+
+
+def unchanged(core: Callable[..., Any]) -> Callable[..., Any]:
+    return core
+
+
+@pytest.mark.parametrize(
+    ("name", "change", "refused"),
+    [
+        ("velocity", scaled, True),
+        ("velocity", without_state, True),
+        ("velocity", at_the_next_time, True),
+        ("velocity", with_padding, True),
+        ("encode", cameras_exchanged, True),
+        ("velocity", unchanged, False),
+    ],
+)
+def test_wrong_programs_in_bfloat16_are_refused(
+    folder: Path, monkeypatch: pytest.MonkeyPatch, name: str, change: Callable[..., Any], refused: bool
+) -> None:
+    def compile_core(core: Callable[..., Any], **_: Any) -> Callable[..., Any]:
+        return change(core) if core.__code__.co_name == f"{name}_{ROWS}" else core
+
+    monkeypatch.setattr(torch, "compile", compile_core)
+    with loading_report(lambda _: None) as report:
+        made(folder, dtype="bfloat16", compile=True, batch_sizes=[ROWS])
+    if refused:
+        [reasons] = report.uncompiled
+        assert f"{name!r} by torch.compile: its results are off by" in reasons
+    else:
+        assert report.uncompiled == []
