@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -17,7 +18,7 @@ import pytest
 from benchmarks.gpu import pack
 from benchmarks.gpu.lab import Acting, Lab, Plan, row_error
 from benchmarks.gpu.runner import Runner, to_markdown
-from benchmarks.gpu.steps import STEPS, Step
+from benchmarks.gpu.steps import GPU_TESTS, STEPS, Step
 from benchmarks.network import NetworkTimer, busy_time
 from vlagents_ray.errors import PolicyFailed
 from vlagents_ray.policies.compilation import Compilation
@@ -107,6 +108,15 @@ def test_it_runs_without_ray_and_needs_no_torch_to_start() -> None:
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
+
+
+def test_what_is_packed_for_a_machine_without_a_network_exists_and_has_what_is_imported_there() -> None:
+    assert [name for name in pack.FOLDERS if not (pack.ROOT / name).exists()] == []
+    files = [*(pack.ROOT / "benchmarks" / "gpu").glob("*.py"), *(pack.ROOT / name for name in GPU_TESTS)]
+    text = "\n".join(file.read_text() for file in files)
+    imported = set(re.findall(r"^ *from (vlagents_ray\w*)", text, re.MULTILINE))
+    packed = {path.parent.name for project in pack.PROJECTS for path in Path(project).glob("vlagents_ray*/py.typed")}
+    assert imported <= packed
 
 
 def test_the_steps_fit_into_the_ten_minutes_of_a_machine() -> None:
