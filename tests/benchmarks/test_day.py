@@ -17,7 +17,7 @@ def test_minutes_with_faults_have_no_jump_and_no_command_after_a_stop(relative: 
     assert normal.stops == 0
     assert normal.moving_s > 100  # of 120
     assert normal.held.get("dynamics", 0) < 10, "without a fault the guard refuses hardly any of 6000 actions"
-    report = day.play_day(3, 20 * MINUTES, normal_step=normal.largest_step, relative=relative, arms=arms)
+    report = day.play_day(3, 10 * MINUTES, normal_step=normal.largest_step, relative=relative, arms=arms)
     assert report.violations == []
     assert report.stops > 3
     assert report.restarts > 0
@@ -33,14 +33,14 @@ def test_a_seed_replays_each_command() -> None:
 
 def test_a_guard_without_limits_lets_jumps_through_which_the_day_finds(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(day, "LIMITS", Limits())
-    report = day.play_day(3, 20 * MINUTES, normal_step=0.02)
+    report = day.play_day(3, 3 * MINUTES, normal_step=0.02)
     assert any("a step of" in one for one in report.violations)
 
 
 def test_a_restart_from_afar_would_be_found(monkeypatch: pytest.MonkeyPatch) -> None:
     """The world's own check: a watchdog that restarts by itself commands without an operator."""
     monkeypatch.setattr(day.DayWatchdog, "overdue", lambda self: (self.restart() and None, None))
-    report = day.play_day(3, 20 * MINUTES, normal_step=0.02)
+    report = day.play_day(3, 3 * MINUTES, normal_step=0.02)
     assert any("a command after: stop from afar" in one for one in report.violations)
 
 

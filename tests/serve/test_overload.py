@@ -780,6 +780,7 @@ def test_an_act_in_compact_form_is_read_again_after_a_refusal(replica: KeyedRepl
 def test_parts_of_messages_before_a_key_are_bounded_at_groots_gateway(monkeypatch: pytest.MonkeyPatch) -> None:
     """12 connections with 24 MiB of a message each take no more than the 64 MiB of one message, and a part more."""
     monkeypatch.setattr(gr00t, "_STRANGER_S", 3.0)
+    monkeypatch.setattr(gr00t, "_MESSAGE_S", 3.0)
     context = GatewayContext("app", _no_replica, DEFAULT_LIMITS, 8, 30.0, None, lambda _: NoKey.OPEN)
     dialect = gr00t.GR00TDialect("gr00t", gr00t.GR00TDialectConfig(), context)
     listener = socket.create_server(("127.0.0.1", 0))
