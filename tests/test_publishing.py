@@ -43,6 +43,17 @@ def test_what_workflows_run_of_this_repository_exists(workflow: Path) -> None:
             assert (ROOT / path).exists(), path
 
 
+def test_the_flood_table_is_played_whole_each_night() -> None:
+    """`make integrations` plays a part of its rows, for too short a time for p99."""
+    table = "tests/serve/test_flood.py"
+    settings = set(re.findall(r"VLAGENTS_FLOOD_[A-Z]+", (ROOT / table).read_text()))
+    assert settings == {"VLAGENTS_FLOOD_ALL", "VLAGENTS_FLOOD_SECONDS"}
+    nightly = [path for path in WORKFLOWS if "cron:" in path.read_text()]
+    [step] = [step for path in nightly for step in steps(path) if table in step.get("run", "")]
+    assert set(step["env"]) == settings
+    assert float(step["env"]["VLAGENTS_FLOOD_SECONDS"]) >= 10
+
+
 def test_the_citation_names_this_version_and_licence() -> None:
     citation = yaml.safe_load((ROOT / "CITATION.cff").read_text())
     assert (citation["version"], citation["license"]) == (PROJECT["version"], PROJECT["license"])
