@@ -268,7 +268,7 @@ class _Run:
         if failure.cause == "user":
             raise from_code(failure.code, failure.message)
         if retried:
-            self._queue.put_back(job.again())
+            self._queue.put_back(job.again(alone=failure.names_no_episode))
             self.progress.retry(job, failure)
             return
         if beyond:
@@ -283,8 +283,9 @@ class _Run:
         if result is None:
             return False
         actions = (result.steps, result.actions_sha256)
-        if self._diverged.setdefault(job.key, actions) != actions or job.attempt == 1:
-            self._diverged[job.key] = actions
+        earlier = self._diverged.get(job.key)
+        self._diverged[job.key] = actions
+        if earlier != actions:
             return False
         self._record(job, result, Artifacts())
         self._attempts.note_policy_error(result.error or "")

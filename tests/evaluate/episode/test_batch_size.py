@@ -11,7 +11,7 @@ import pytest
 from in_process_evaluation import flat_config
 
 from vlagents_ray.contract import ActionSpec, Contract, StateSpec
-from vlagents_ray.envs.base import EvalEnv
+from vlagents_ray.envs.base import ERROR, BatchEnv, EvalEnv, SequentialBatch
 from vlagents_ray.errors import EnvFailed, InvalidAction
 from vlagents_ray.evaluate import EvalConfig, evaluate
 from vlagents_ray.evaluate.report.page import write_report
@@ -80,6 +80,23 @@ class Fragile(EvalEnv):
         return Obs(state={"seed": np.full(width, self._seed if number is None else number, np.float32)})
 
 
+class InOneSimulator(SequentialBatch):
+    """Environments of one simulator, which raises for all of them what one of them raises."""
+
+    def step(self, acts: Any) -> Any:
+        steps = super().step(acts)
+        for info in steps[-1]:
+            if ERROR in info:
+                raise info[ERROR]
+        return steps
+
+
+class FragileTogether(Fragile):
+    @classmethod
+    def batched(cls, num_envs: int, **options: Any) -> BatchEnv | None:
+        return InOneSimulator([cls(**options) for _ in range(num_envs)])
+
+
 class Extreme(Agent):
     """Exceeds the limit in the third step of each third episode, and always in another way if it is `restless`."""
 
@@ -108,8 +125,8 @@ class Extreme(Agent):
 def run(config: Config, tmp_path: Any) -> Callable[..., Summary]:
     def play(trouble: str, num_envs: int = 1, **options: Any) -> Summary:
         settings = flat_config(
-            envs=[NAME], env_options={"trouble": trouble}, episodes=EPISODES, num_envs=num_envs, workers=0,
-            video="none", out=tmp_path / f"{num_envs}", abort_after=0, retries=1, **options,
+            env_options={"trouble": trouble}, episodes=EPISODES, num_envs=num_envs, workers=0,
+            video="none", out=tmp_path / f"{num_envs}", abort_after=0, **{"envs": [NAME], "retries": 1, **options},
         )  # fmt: skip
         return evaluate(settings, agent_factory=Extreme)
 
@@ -131,6 +148,17 @@ def test_an_episode_that_fails_leaves_those_beside_it_as_they_are(run: Callable[
     assert {episode for episode, (status, *_) in alone.items() if status != "done"} == {1, 4, 7}
     assert outcomes(run(trouble, num_envs=4)) == alone
     assert outcomes(run(trouble, num_envs=3)) == alone
+
+
+@pytest.mark.parametrize("trouble", ["refuses", *EXPLOSIONS])
+def test_an_error_of_a_simulator_of_several_environments_names_its_episode(
+    run: Callable[..., Summary], trouble: str
+) -> None:
+    """After an error that is of one of the episodes, each is played alone."""
+    alone = outcomes(run(trouble))
+    together = run(trouble, num_envs=4, envs=[f"{__name__}:FragileTogether"], retries=2)
+    assert outcomes(together) == alone
+    assert together.cells[0].infra_failures == 0
 
 
 @pytest.mark.parametrize("trouble", ["diverges", "reward", *EXPLOSIONS])

@@ -76,6 +76,7 @@ class Failure:
     traceback: str = ""
     log: str = ""  # the end of the worker's log, if it broke
     diverged: EpisodeResult | None = None  # if the simulation diverged: the result if the policy is the cause
+    names_no_episode: bool = False  # whether another episode in the same simulator may be the cause
 
 
 def explain(error: errors.VLAgentsError) -> Failure:
@@ -89,6 +90,16 @@ def explain(error: errors.VLAgentsError) -> Failure:
     if cause == "policy":
         message += next((cure for kind, cure in _CURES.items() if isinstance(error, kind)), "")
     return Failure(cause, error.code, message, "".join(traceback.format_exception(error)))
+
+
+def explain_batch(error: errors.VLAgentsError, episodes: int) -> Failure:
+    """Return the failure for an `error` that ended a number of `episodes` in one simulator.
+
+    An action that the simulator refuses and a simulation that diverges belong to one of them, which is not known.
+    """
+    if episodes > 1 and (isinstance(error, errors.InvalidAction) or raised_by_divergence(error)):
+        return replace(explain(error), cause="worker", names_no_episode=True)
+    return explain(error)
 
 
 class _Side:

@@ -32,10 +32,11 @@ class Job:
     key: EpisodeKey
     cell: EvalCase
     attempt: int = 1
+    alone: bool = False  # whether it is played without others in its simulator, so that an error names this episode
 
-    def again(self) -> Job:
-        """Return the next attempt at the same episode."""
-        return replace(self, attempt=self.attempt + 1)
+    def again(self, *, alone: bool = False) -> Job:
+        """Return the next attempt at the same episode, which stays `alone`."""
+        return replace(self, attempt=self.attempt + 1, alone=self.alone or alone)
 
 
 def plan(cells: Iterable[EvalCase]) -> list[Job]:
@@ -108,7 +109,8 @@ class JobQueue:
         jobs = self._waiting[place]
         taken = [jobs.popleft()]
         cell = taken[0].cell
-        while jobs and len(taken) < cell.suite.num_envs and jobs[0].cell.fingerprint == cell.fingerprint:
+        number = 1 if taken[0].alone else cell.suite.num_envs
+        while jobs and len(taken) < number and jobs[0].cell.fingerprint == cell.fingerprint and not jobs[0].alone:
             taken.append(jobs.popleft())
         return tuple(taken)
 

@@ -30,7 +30,7 @@ from vlagents_ray.envs.graphics import require_own
 from vlagents_ray.errors import ConfigError, EnvFailed, MissingDependency, VLAgentsError
 from vlagents_ray.evaluate.artifacts.recorder import Artifacts, EpisodeRecorder, RecorderFactory, Recording
 from vlagents_ray.evaluate.episode import episode
-from vlagents_ray.evaluate.episode.failures import Failure, env_side, explain, policy_side
+from vlagents_ray.evaluate.episode.failures import Failure, env_side, explain, explain_batch, policy_side
 from vlagents_ray.evaluate.episode.records import EnvInfo, EpisodeResult, WorkerInfo
 from vlagents_ray.evaluate.plan.cases import EvalCase, env_program
 from vlagents_ray.evaluate.plan.config import EvalConfig, PolicyConfig
@@ -124,7 +124,7 @@ class Rollout:
         try:
             reports = self._played(jobs, found)
         except VLAgentsError as error:
-            reports = [Report(failure=explain(error))] * len(jobs)
+            reports = [Report(failure=explain_batch(error, len(jobs)))] * len(jobs)
         finally:
             self._set_phase("idle", 0)
         if any(report.failure is not None and report.failure.cause == "policy" for report in reports):
