@@ -24,6 +24,7 @@ from gr00t_client import PolicyClient
 from benchmarks.processes import cpu_seconds
 from vlagents_ray.client.transports.shm import ShmTransport
 from vlagents_ray.protocol.messages import Request
+from vlagents_ray.serve.launch.haproxy import haproxy_binary
 from vlagents_ray_dialects.messages import lerobot
 
 pytestmark = [pytest.mark.alone, pytest.mark.slow, pytest.mark.integration]
@@ -106,12 +107,13 @@ def resources(server: int) -> tuple[float, int]:
 
 
 # uvicorn's port is behind HAProxy, which forwards no connection without complete headers, and bounds their number
-# (`launch/test_haproxy.py`).
+# (`HTTP_TABLE`, and `launch/test_haproxy.py`).
 OF_HAPROXY = ("nothing", "half a handshake", "closed at once")
 TABLE = [
     *(("own port", behaviour) for behaviour in flood.BEHAVIOURS),
     *(("WS /v1/stream", behaviour) for behaviour in flood.BEHAVIOURS if behaviour not in OF_HAPROXY),
     *(("shared memory", behaviour) for behaviour in flood.NEAR),
+    *((flood.PLASMA, behaviour) for behaviour in flood.NEAR_PLASMA),
     *((page, behaviour) for page in flood.PAGES for behaviour in (*flood.BEHAVIOURS, *flood.OF_VIEWERS)),
     *(
         (way, behaviour)
@@ -138,7 +140,9 @@ Robot = Callable[[], object]  # one call of a robot
 
 
 @pytest.fixture(scope="module")
-def robots(robot: ShmTransport, gateways: flood.Where, page: flood.Where) -> Iterator[dict[str, Robot]]:
+def robots(
+    robot: ShmTransport, where: flood.Where, gateways: flood.Where, page: flood.Where
+) -> Iterator[dict[str, Robot]]:
     """A robot of the replica, and those of the gateways, by the way of the attack beside them."""
 
     def act() -> None:
@@ -157,6 +161,7 @@ def robots(robot: ShmTransport, gateways: flood.Where, page: flood.Where) -> Ite
             assert answer.read()
 
     with (
+        flood.http_robot(where) if where["proxied"] else contextlib.nullcontext(act) as act_over_http,
         PolicyClient(ports["gr00t"], "robot") as of_gr00t,
         socket.create_connection(("127.0.0.1", ports["vlagents"]), timeout=60) as of_vlagents,
         grpc.insecure_channel(f"127.0.0.1:{ports['lerobot']}") as of_lerobot,
@@ -168,8 +173,9 @@ def robots(robot: ShmTransport, gateways: flood.Where, page: flood.Where) -> Ite
             assert of_vlagents.recv(4096)
 
         yield {
-            **dict.fromkeys(flood.WAYS, act),
+            **dict.fromkeys([*flood.WAYS, flood.PLASMA], act),
             **dict.fromkeys(flood.PAGES, show),
+            **dict.fromkeys(flood.HTTP, act_over_http),
             "gr00t": of_gr00t.ping,
             "vlagents": name,
             "lerobot": lambda: ready(b"", timeout=60),
@@ -190,10 +196,15 @@ GATEWAY_TABLE = [
     for way, behaviours in flood.GATEWAYS.items()
     for name in behaviours
 ]
+HTTP_TABLE = [
+    pytest.param(way, name, marks=pytest.mark.skipif(haproxy_binary() is None, reason="HAProxy is not installed"))
+    for way in flood.HTTP
+    for name in flood.HTTP_BEHAVIOURS
+]
 
 
 # A row takes about ten seconds: every fourth one by default, all with VLAGENTS_FLOOD_ALL=1.
-ROWS = [*TABLE, *GATEWAY_TABLE] if os.environ.get("VLAGENTS_FLOOD_ALL") else [*TABLE, *GATEWAY_TABLE][::4]
+ROWS = [*TABLE, *GATEWAY_TABLE, *HTTP_TABLE][:: 1 if os.environ.get("VLAGENTS_FLOOD_ALL") else 4]
 
 
 @pytest.mark.parametrize(("way", "behaviour"), ROWS)
@@ -216,7 +227,7 @@ def test_no_behaviour_of_a_connection_delays_a_robot_or_leaves_anything(
         where = page
     call()
     memory, sockets = resources(where["pid"])
-    name = "replica" if way in flood.WAYS else way
+    name = "replica" if way in (*flood.WAYS, flood.PLASMA) else "HAProxy" if way in flood.HTTP else way
     for attempt in range(ATTEMPTS):
         if attempt or name not in alone_ms:
             await_calm(where["pid"])  # an attempt before this one may have left much to do

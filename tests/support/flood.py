@@ -1,6 +1,6 @@
 """A keyed replica in a process of its own, and one that floods it.
 
-`flood.py serve`, `flood.py gateways`, `flood.py page`, and `flood.py attack WAY PART WHERE CONNECTIONS S`.
+`flood.py serve`, `flood.py haproxy PORT`, `flood.py gateways`, `flood.py page`, and `flood.py attacks`.
 """
 
 from __future__ import annotations
@@ -16,12 +16,14 @@ import socket
 import struct
 import subprocess
 import sys
+import tempfile
 import threading
 import time
 import zlib
 from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass
 from functools import cache, partial
+from http.client import HTTPConnection
 from pathlib import Path
 from typing import Any
 from urllib.parse import urlsplit
@@ -29,9 +31,14 @@ from urllib.parse import urlsplit
 import grpc
 import hostile_images
 import numpy as np
+import pytest
 import rpyc_client
+from api_key_replica import plasma_server
 from asgi_server import served
 from dialect_server import ALL, METADATA
+from eval_fakes import wait_for
+from starlette.responses import PlainTextResponse
+from starlette.types import ASGIApp, Receive, Scope, Send
 from websockets.client import ClientProtocol
 from websockets.extensions.permessage_deflate import ClientPerMessageDeflateFactory
 from websockets.protocol import State
@@ -44,8 +51,8 @@ from vlagents_ray.errors import PolicyUnavailable
 from vlagents_ray.images import jpeg_png
 from vlagents_ray.interface import Act, Agent, Obs
 from vlagents_ray.protocol import frame_layout
-from vlagents_ray.protocol.frames import CONTENT_TYPE
-from vlagents_ray.protocol.messages import Limits, LocalAddress, Request
+from vlagents_ray.protocol.frames import CONTENT_TYPE, encode_requests
+from vlagents_ray.protocol.messages import Limits, LocalAddress, Op, PlasmaAddress, Request
 from vlagents_ray.protocol.websocket_frames import frame_head
 from vlagents_ray.registry import dialect_class
 from vlagents_ray.serve.access.api_keys import Keys, NoKey
@@ -54,13 +61,15 @@ from vlagents_ray.serve.dialects.base import GatewayContext, ReplicaContext, dia
 from vlagents_ray.serve.endpoints.access_middleware import AccessMiddleware
 from vlagents_ray.serve.endpoints.front import FrontMiddleware
 from vlagents_ray.serve.endpoints.http import build_http_app
+from vlagents_ray.serve.endpoints.plasma import PlasmaServer
 from vlagents_ray.serve.endpoints.shm import ShmServer
 from vlagents_ray.serve.endpoints.websocket import WebSocketServer
 from vlagents_ray.serve.engine.admission import Admission
 from vlagents_ray.serve.engine.engine import Engine
+from vlagents_ray.serve.launch.haproxy import haproxy_binary, ingress_environment
 from vlagents_ray.serve.observers.live_page import page_server
 from vlagents_ray.serve.observers.live_view import Fleet
-from vlagents_ray.serve.ports import reserve
+from vlagents_ray.serve.ports import free_port, reserve
 from vlagents_ray.wire import json_numpy
 from vlagents_ray_dialects import gr00t, vlagents
 from vlagents_ray_dialects import lerobot as lerobot_dialect
@@ -87,29 +96,103 @@ def _key(name: str, **limits: Any) -> dict[str, Any]:
 
 def key_of(way: str) -> str:
     """The key of whoever floods that way, which is its name, too."""
-    return f"way-{[*WAYS, *GATEWAYS, *PAGES].index(way)}"
+    return f"way-{[*WAYS, *GATEWAYS, *PAGES, *HTTP, PLASMA].index(way)}"
 
 
 def serve() -> None:
     """Say where it is, as JSON, and serve until the standard input ends."""
-    rated = [_key(key_of(way), rate=1, rank="simulation") for way in WAYS]
+    rated = [_key(key_of(way), rate=1, rank="simulation") for way in (*WAYS, *HTTP)]
     keys = Keys.from_text(json.dumps({"keys": [_key("robot"), *rated]}))
     admit, limits = partial(keys.check, app="app"), Limits()
     engine = Engine(_Policy())
     own = WebSocketServer(engine, limits, "127.0.0.1", None, admit, slow_s=SLOW_S)
     near = ShmServer(engine, limits, admit)
-    own.open(), near.open()
+    with pytest.MonkeyPatch.context() as patch, tempfile.TemporaryDirectory() as folder:
+        plasma = plasma_server(engine, limits, patch, Path(folder))
+        del plasma.pool.claim  # of tests whose channels are in this process; none is leased here
+        _serve_replica(engine, keys, own, near, plasma)
+
+
+def _serve_replica(engine: Engine, keys: Keys, own: WebSocketServer, near: ShmServer, plasma: PlasmaServer) -> None:
+    limits = Limits()
+    for endpoint in (own, near, plasma):
+        endpoint.open()
     engine.start()
     routes = dialect_routes(DialectArgs(**ALL), ReplicaContext(engine, lambda: METADATA, limits))
     inside = build_http_app(engine, lambda: METADATA, limits, more=routes)
-    with served(
-        FrontMiddleware(AccessMiddleware(inside, keys, "app", slow_s=SLOW_S, admission=engine.admission))
-    ) as port:
-        found = {"port": port, "own": [own.address.port, own.path], "local": asdict(near.address)}
+    guarded = AccessMiddleware(inside, keys, "app", slow_s=SLOW_S, admission=engine.admission)
+    with served(_with_health_check(FrontMiddleware(guarded))) as port, _haproxy(port) as proxied:
+        found = {
+            "port": port,
+            "proxied": proxied,
+            "own": [own.address.port, own.path],
+            "local": asdict(near.address),
+            "plasma": plasma.plasma.socket,
+        }
         print(json.dumps(found), flush=True)
         sys.stdin.read()
     engine.close()
-    own.close(), near.close()
+    for endpoint in (own, near, plasma):
+        endpoint.close()
+
+
+def _with_health_check(app: ASGIApp) -> ASGIApp:
+    """Answer HAProxy's health check, as Serve does."""
+
+    async def run(scope: Scope, receive: Receive, send: Send) -> None:
+        is_check = scope["type"] == "http" and scope["path"] == "/-/healthz"
+        await (PlainTextResponse("success") if is_check else app)(scope, receive, send)
+
+    return run
+
+
+@contextlib.contextmanager
+def _haproxy(replica: int) -> Iterator[int]:
+    """The port of HAProxy in front of a replica's port; 0 if it is not installed."""
+    if haproxy_binary() is None:
+        yield 0
+        return
+    with child("haproxy", str(replica)) as process:
+        port: int = json.loads(process.stdout.readline())["port"]  # type: ignore[union-attr]
+        yield port
+
+
+def serve_haproxy(replica: int) -> None:
+    """Run HAProxy with the settings that Serve writes, in front of a replica's port; print its own port as JSON."""
+    with tempfile.TemporaryDirectory(dir="/tmp") as name:
+        folder, port = Path(name), free_port()
+        os.environ.update(ingress_environment(folder, str(haproxy_binary())))  # Serve reads it when it is imported
+        from ray.serve._private.haproxy import (
+            BackendConfig,
+            HAProxyApi,
+            HAProxyConfig,
+            ServerConfig,
+            get_haproxy_binary,
+        )
+        from ray.serve.config import HTTPOptions
+
+        replicas = [ServerConfig("SERVE_REPLICA_app-Policy-1", "127.0.0.1", replica)]
+        backend = BackendConfig("http-app", "/", servers=replicas, app_name="app")
+        config = HAProxyConfig(
+            http_options=HTTPOptions(host="127.0.0.1", port=port), has_received_routes=True, has_received_servers=True
+        )
+        api = HAProxyApi(config, {"app": backend})
+        api._generate_config_file_internal()
+        with subprocess.Popen([get_haproxy_binary(), "-db", "-f", api.config_file_path, "-dR"]) as proxy:
+            wait_for(lambda: _is_healthy(port), 30)
+            print(json.dumps({"port": port}), flush=True)
+            sys.stdin.read()
+            proxy.terminate()
+
+
+def _is_healthy(port: int) -> bool:
+    """Return whether HAProxy's health check finds the replica."""
+    with contextlib.closing(HTTPConnection("127.0.0.1", port, timeout=5)) as connection:
+        try:
+            connection.request("GET", "/-/healthz")
+            return connection.getresponse().status == 200
+        except OSError:
+            return False
 
 
 def _no_replica(*_: object) -> RemoteAgent:
@@ -433,6 +516,104 @@ def misbehave(path: str, behaviour: str, where: Where, key: str, end: float) -> 
                 connection.sendall(payload)
 
 
+# Routes behind HAProxy: the replica's own, and a dialect's.
+HTTP = {"HAProxy, POST /v1/act": ("/v1/act", CONTENT_TYPE), "HAProxy, POST /act": ("/act", "application/json")}
+
+
+def _request(way: str, key: str, *fields: str) -> bytes:
+    """The head of a request with a key, and further header fields."""
+    path, kind = HTTP[way]
+    lines = [
+        f"POST {path} HTTP/1.1",
+        "host: localhost",
+        f"authorization: Bearer {key}",
+        f"content-type: {kind}",
+        "x-session-id: flood",
+        *fields,
+    ]
+    return "\r\n".join([*lines, "", ""]).encode()
+
+
+def _with_content(way: str, key: str, content: bytes) -> bytes:
+    return _request(way, key, f"content-length: {len(content)}") + content
+
+
+_LARGE = f"content-length: {15 * 2**20}"
+_HEADER_FIELD = "a: " + "b" * 1000
+
+
+@dataclass(frozen=True)
+class HttpBehaviour:
+    """What a client of HTTP sends over a connection: once, and then a part again and again."""
+
+    once: Callable[[str, str], bytes]  # by the way and the key
+    repeated: Callable[[str, str], bytes] = lambda _way, _key: b""
+    period_s: float = 0.0  # between two of the repeated parts
+    waits: bool = True  # whether the client then waits for the end of the connection
+
+
+HTTP_BEHAVIOURS = {
+    "nothing": HttpBehaviour(lambda _way, _key: b""),
+    "closed at once": HttpBehaviour(lambda _way, _key: b"", waits=False),
+    "half a head": HttpBehaviour(lambda way, key: _request(way, key)[:-2]),
+    "a head byte by byte": HttpBehaviour(lambda way, key: _request(way, key)[:-2], lambda _way, _key: b"a", 0.05),
+    "a head that is too long": HttpBehaviour(lambda way, key: _request(way, key, *[_HEADER_FIELD] * 100)),
+    "requests without a key": HttpBehaviour(
+        lambda _way, _key: b"", lambda way, _key: _with_content(way, "wrong", b"x") * 100, 0.01
+    ),
+    "large requests without a key": HttpBehaviour(
+        lambda way, _key: _request(way, "wrong", _LARGE), lambda _way, _key: bytes(2**18)
+    ),
+    "half a message": HttpBehaviour(lambda way, key: _request(way, key, _LARGE) + bytes(2 * 2**20)),
+    DRIPPED: HttpBehaviour(lambda way, key: _request(way, key, _LARGE), lambda _way, _key: b"x", 0.05),
+    "chunks without an end": HttpBehaviour(
+        lambda way, key: _request(way, key, "transfer-encoding: chunked"), lambda _way, _key: b"1\r\nx\r\n" * 1000
+    ),
+    "small requests": HttpBehaviour(lambda _way, _key: b"", lambda way, key: _with_content(way, key, b"x") * 100, 0.01),
+    "small requests by reconnects": HttpBehaviour(lambda way, key: _with_content(way, key, b"x"), waits=False),
+    "a continuation that is awaited": HttpBehaviour(
+        lambda way, key: _request(way, key, _LARGE, "expect: 100-continue")
+    ),
+    "a refused upgrade": HttpBehaviour(
+        lambda way, key: _request(way, key, "connection: upgrade", "upgrade: websocket"), waits=False
+    ),
+}
+
+
+def misbehave_over_http(way: str, name: str, where: Where, end: float) -> None:
+    """Behave in that way over one connection to HAProxy, until it ends the connection, or until the `end`."""
+    behaviour, key = HTTP_BEHAVIOURS[name], key_of(way)
+    with socket.create_connection(("127.0.0.1", where["proxied"]), timeout=5) as connection:
+        connection.settimeout(max(0.01, end - time.monotonic()))
+        connection.sendall(behaviour.once(way, key))
+        repeated = behaviour.repeated(way, key)
+        if repeated:
+            threading.Thread(target=_drain, args=(connection,), daemon=True).start()
+            while time.monotonic() < end:
+                connection.sendall(repeated)
+                time.sleep(behaviour.period_s)
+        elif behaviour.waits:
+            _drain(connection)
+        elif name != "closed at once":
+            connection.recv(65536)
+
+
+@contextlib.contextmanager
+def http_robot(where: Where) -> Iterator[Callable[[], None]]:
+    """An act of a robot over HTTP through HAProxy, in a session of its own."""
+    headers = {"authorization": "Bearer robot", "content-type": CONTENT_TYPE, "x-session-id": "robot"}
+    with contextlib.closing(HTTPConnection("127.0.0.1", where["proxied"], timeout=60)) as connection:
+
+        def send(op: Op) -> None:
+            connection.request("POST", f"/v1/{op}", encode_requests([Request(op, OBS)]), headers)
+            answer = connection.getresponse()
+            content = answer.read()
+            assert answer.status == 200, content[:500]
+
+        send("reset")
+        yield partial(send, "act")
+
+
 @dataclass(frozen=True)
 class Behaviour:
     """What a client of a gateway sends over a connection: once, then a part again and again, or byte by byte."""
@@ -611,18 +792,30 @@ NEAR: dict[str, tuple[bool, bytes, bool]] = {
     "a number without a file": (True, _MEMORY.pack(LocalAddress.FILES + 1, 0, 100), True),
     "many connections": (True, b"", False),
 }
+PLASMA = "plasma"
+_CHANNEL = PlasmaAddress.REQUEST
+# The same, of a process of this user that no channel is leased to; the endpoint needs no key.
+NEAR_PLASMA: dict[str, tuple[bool, bytes, bool]] = {
+    "nothing": (False, b"", False),
+    "closed at once": (False, b"", False),
+    "half a head": (False, bytes(_CHANNEL.size - 1), True),
+    "a long message": (False, bytes(200_000), True),
+    "a channel that is not leased": (False, _CHANNEL.pack(bytes(28), 0), True),
+    "many connections": (False, b"", False),
+}
 _MANY = 60  # connections of each thread
 
 
-def misbehave_near(behaviour: str, where: Where, key: str, end: float) -> None:
-    """Behave in that way at the shared memory's socket, until the server ends the connection, or until the `end`."""
-    shows_key, message, repeats = NEAR[behaviour]
+def misbehave_near(way: str, behaviour: str, where: Where, end: float) -> None:
+    """Behave in that way at the socket of shared memory or plasma, until the server ends it, or until the `end`."""
+    address = where["plasma"] if way == PLASMA else "\0" + where["local"]["socket"]
+    shows_key, message, repeats = (NEAR_PLASMA if way == PLASMA else NEAR)[behaviour]
     with contextlib.ExitStack() as stack:
         for _ in range(_MANY if behaviour == "many connections" else 1):
             connection = stack.enter_context(socket.socket(*UNIX))
-            connection.connect("\0" + where["local"]["socket"])
+            connection.connect(address)
             if shows_key:
-                connection.send(key.encode())
+                connection.send(key_of(way).encode())
         if behaviour == "closed at once":
             return
         threading.Thread(target=_drain, args=(connection,), daemon=True).start()
@@ -638,7 +831,8 @@ def attack(way: str, part: str, where: Where, connections: int, seconds: float) 
     """Send the largest messages, or misbehave, for so long, as fast as bytes are taken, whatever is answered."""
     make, send = WAYS.get(way, (bytes, _shared_memory))
     end = time.monotonic() + seconds
-    is_behaviour = part in BEHAVIOURS or part in OF_VIEWERS or part in NEAR or way in GATEWAYS
+    of_way = way in GATEWAYS or way in HTTP or way == PLASMA
+    is_behaviour = of_way or part in BEHAVIOURS or part in OF_VIEWERS or part in NEAR
     message = b"" if is_behaviour else PARTS.get(part, make)()
     if part in REPEATED:
         REPEATED[part]()  # before it is measured, since the bomb takes time to make
@@ -648,8 +842,10 @@ def attack(way: str, part: str, where: Where, connections: int, seconds: float) 
             with contextlib.suppress(OSError):  # cut off: once more
                 if way in GATEWAYS:
                     misbehave_at_gateway(way, part, where, end)
-                elif way == "shared memory" and part in NEAR:
-                    misbehave_near(part, where, key_of(way), end)
+                elif way in HTTP:
+                    misbehave_over_http(way, part, where, end)
+                elif way == PLASMA or (way == "shared memory" and part in NEAR):
+                    misbehave_near(way, part, where, end)
                 elif part in BEHAVIOURS or part in OF_VIEWERS:
                     misbehave((WEBSOCKETS | PAGES)[way], part, where, key_of(way), end)
                 else:
@@ -765,6 +961,8 @@ def percentile(taken: list[float], percent: float) -> float:
 if __name__ == "__main__":
     if sys.argv[1] == "serve":
         serve()
+    elif sys.argv[1] == "haproxy":
+        serve_haproxy(int(sys.argv[2]))
     elif sys.argv[1] == "gateways":
         serve_gateways()
     elif sys.argv[1] == "page":
