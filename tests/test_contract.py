@@ -19,7 +19,7 @@ from vlagents_ray.errors import (
     NotOffered,
 )
 from vlagents_ray.interface import Act, Obs
-from vlagents_ray.validation import check_action, check_observation
+from vlagents_ray.validation import LARGEST_ACTION, check_action, check_observation
 
 POLICY = Contract(
     cameras={"front": CameraSpec(224, 224), "wrist": CameraSpec()},
@@ -205,6 +205,18 @@ def test_a_number_that_is_none_is_found_wherever_it_is(size: int, bad: float) ->
             check_observation(Obs(state={"joints": part}), None)
         with pytest.raises(InvalidAction, match="NaN or infinity"):
             check_action(part.reshape(1, -1), None)
+
+
+@pytest.mark.parametrize("size", [1, 63, 64, 65, 4096])
+@pytest.mark.parametrize("sign", [1, -1])
+def test_a_number_that_is_too_large_for_any_unit_is_found_wherever_it_is(size: int, sign: int) -> None:
+    for at in (0, size // 2, size - 1):
+        action = np.zeros(size, np.float32)
+        action[at] = sign * LARGEST_ACTION
+        check_action(action, None)
+        action[at] = sign * 1e30
+        with pytest.raises(InvalidAction, match=r"got a number of size 1e\+30, want at most 1e\+09"):
+            check_action(action, None)
 
 
 @pytest.mark.parametrize("action", [[0.0] * 7, np.zeros((8, 7)), np.zeros(7, np.float64)])

@@ -10,6 +10,7 @@ from vlagents_ray.contract import Contract, _differ
 from vlagents_ray.errors import InvalidAction, InvalidObservation, MissingCamera, MissingState, NotOffered
 from vlagents_ray.interface import WANT, Obs
 
+LARGEST_ACTION = 1e9  # beyond it no number of an action has a meaning, in any unit
 _FEW = 64  # size of arrays up to which Python's own check is faster than numpy's
 _UINT8, _FLOAT32 = np.dtype(np.uint8), np.dtype(np.float32)
 
@@ -73,6 +74,12 @@ def check_action(action: object, contract: Contract | None) -> np.ndarray:
         raise InvalidAction(f"action: got {described(action)}, want (D,) or (H, D) float32")
     if not _finite(array):
         raise InvalidAction("action: got NaN or infinity; the policy's output is broken")
+    largest = _largest(array)
+    if largest > LARGEST_ACTION:
+        raise InvalidAction(
+            f"action: got a number of size {largest:.3g}, want at most {LARGEST_ACTION:g}; "
+            f"the policy's output is broken"
+        )
     if contract is not None and contract.action.dim not in (None, array.shape[-1]):
         raise InvalidAction(f"action: got {array.shape}, want {contract.action.dim} numbers a row")
     return array
@@ -83,6 +90,13 @@ def _finite(array: np.ndarray) -> bool:
     if array.size <= _FEW:
         return all(map(math.isfinite, array.ravel().tolist()))
     return bool(np.isfinite(array).all())
+
+
+def _largest(array: np.ndarray) -> float:
+    """Return the largest absolute value."""
+    if array.size <= _FEW:
+        return float(max(map(abs, array.ravel().tolist())))
+    return float(np.abs(array).max())
 
 
 def described(value: object) -> str:

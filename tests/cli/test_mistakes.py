@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import subprocess
 import sys
 import time
 from pathlib import Path
@@ -54,6 +55,11 @@ class WrongShape(Base):
 class NotFinite(Base):
     def act(self, obs):
         return Act(np.full(4, np.nan, np.float32))
+
+
+class Enormous(Base):
+    def act(self, obs):
+        return Act(np.full(4, 1e30, np.float32))
 
 
 class Text(Base):
@@ -246,9 +252,10 @@ MADE = {"env setting negative"}  # mistakes that are found when the environment 
 # In this process, until the policy's error: (policy, parts of the message).
 EPISODES = {
     "WithoutAct": ["act or act_batch"],
-    "WrongKey": ["KeyError", "own.py:"],
+    "WrongKey": ["KeyError", "own.py:", "the standard error of its process has the traceback"],
     "WrongShape": ["(3,)", "4"],
     "NotFinite": ["NaN or infinity"],
+    "Enormous": ["size 1e+30", "at most 1e+09"],
     "Text": ["str", "Act"],
     "Ends": ["SystemExit"],
     "EndsItsProcess": ["os._exit(0)", "raise an exception instead", "own.py:"],
@@ -309,7 +316,14 @@ def test_a_mistake_on_the_command_line_is_answered_with_its_cure(mistake: str, f
     assert sorted(os.listdir(folder)) == sorted([*before, *(["out"] if mistake in MADE else [])])
 
 
-@pytest.mark.parametrize("words", [["keys", "new", "x", "--keys", "new.json"], ["new", "policy", "mine"]])
+@pytest.mark.parametrize(
+    "words",
+    [
+        ["keys", "new", "x", "--keys", "new.json"],
+        *(["new", kind, "mine"] for kind in ("policy", "env", "dialect", "plugin")),
+    ],
+    ids=" ".join,
+)
 def test_a_full_disk_is_named_and_nothing_is_left(
     words: list[str], folder: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -333,6 +347,15 @@ def test_a_full_disk_is_named_and_nothing_is_left(
         "error the disk is full (No space left on device); make room, and repeat the command",
     )
     assert sorted(os.listdir(folder)) == before
+
+
+@pytest.mark.parametrize(("word", "guess"), [("robbot", "; did you mean 'robot'?\n"), ("serve", ".\n")])
+def test_a_command_that_the_light_install_lacks_is_answered_with_those_that_it_has(word: str, guess: str) -> None:
+    program = "import sys; sys.modules['typer'] = None; from vlagents_ray.cli import main; main()"
+    done = subprocess.run([sys.executable, "-c", program, word], capture_output=True, text=True, check=False)
+    assert done.returncode == 1
+    assert f"this is the light install of a robot's computer{guess}" in done.stderr
+    assert "pip install 'vlagents-ray[serve]'" in done.stderr
 
 
 @pytest.mark.parametrize("policy", EPISODES)

@@ -9,6 +9,8 @@ import signal
 import sys
 from types import FrameType
 
+from vlagents_ray.naming import did_you_mean
+
 
 def main() -> None:
     """Run the console script; name the packages to install if only the light install is there."""
@@ -28,8 +30,9 @@ def main() -> None:
     except ModuleNotFoundError as error:
         if error.name is None or error.name.startswith("vlagents_ray"):
             raise
+        guess = did_you_mean(" ".join(sys.argv[1:2]), ["robot"]) or "."
         sys.stderr.write(
-            f"vlagents-ray: {error.name!r} is not installed; this is the light install of a robot's computer.\n"
+            f"vlagents-ray: {error.name!r} is not installed; this is the light install of a robot's computer{guess}\n"
             "It has `vlagents-ray robot`. For the other commands: pip install 'vlagents-ray[serve]', and "
             "'vlagents-ray[sim]' to evaluate.\n"
         )

@@ -97,9 +97,9 @@ def render(name: str, kind: Kind) -> dict[Path, str]:
     names = {"name": name, "title": "".join(word.title() for word in name.split("_"))}
     templates = files(__package__ or "") / "skeletons" / kind
     texts = {}
-    for file, source in _FILES[kind].items():
+    for pattern, source in _FILES[kind].items():
         template = (templates / f"{source}.template").read_text("utf-8")
-        texts[Path(Template(file).substitute(names))] = Template(template).substitute(names)
+        texts[Path(Template(pattern).substitute(names))] = Template(template).substitute(names)
     return texts
 
 
@@ -112,14 +112,22 @@ def _write(name: str, kind: Kind) -> None:
         raise ConfigError(f"{', '.join(there)}: there already, and nothing was written; choose another NAME")
     if importlib.util.find_spec(name) is not None:
         raise ConfigError(f"NAME: {name!r} is a module that is installed, and yours would hide it; choose another one")
+    created: list[Path] = []  # files and folders, in order
     try:
         for path, text in texts.items():
-            path.parent.mkdir(parents=True, exist_ok=True)
-            with path.open("x") as written:
-                written.write(text)
+            for folder in reversed(path.parents[:-1]):
+                if not folder.exists():
+                    folder.mkdir()
+                    created.append(folder)
+            with path.open("x") as file:
+                created.append(path)
+                file.write(text)
     except OSError:
-        for path in texts:
-            path.unlink(missing_ok=True)
+        for path in reversed(created):
+            if path.is_dir():
+                path.rmdir()
+            else:
+                path.unlink()
         raise
     out.print(f"wrote {', '.join(map(str, texts))}. Next, in this folder:")
     if kind != "plugin":

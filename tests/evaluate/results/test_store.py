@@ -145,6 +145,10 @@ def test_a_plan_that_becomes_smaller_or_may_stop_early_is_a_change(
 def test_resuming_a_folder_without_results_says_so(config: Config, caplog: pytest.LogCaptureFixture) -> None:
     Store(config(resume=True)).close()
     assert "has no results to resume" in caplog.text
+    assert "did you mean" not in caplog.text
+    mistyped = config(resume=True).out.with_name("ouut")
+    Store(config(resume=True, out=mistyped)).close()
+    assert "did you mean 'out'?" in caplog.text
 
 
 @pytest.mark.parametrize(

@@ -36,6 +36,7 @@ from vlagents_ray.evaluate.results.changes import (
     program_id,
 )
 from vlagents_ray.evaluate.results.database import FILE, RUNNING, WAIT_S, create, insert, lock, require_readable
+from vlagents_ray.naming import did_you_mean
 
 log = logging.getLogger(__name__)
 
@@ -282,7 +283,12 @@ class Store(AbstractContextManager["Store"]):
         runs, episodes = (db.execute(f"SELECT COUNT(*) FROM {table}").fetchone()[0] for table in ("runs", "episodes"))  # noqa: S608
         causes = {cause for (cause,) in db.execute("SELECT DISTINCT cause FROM attempts")}
         if not runs and config.resume:
-            log.warning("%s: has no results to resume (--resume), so that the evaluation begins there", self._out)
+            others = [file.parent.name for file in self._out.parent.glob(f"*/{FILE}")]
+            log.warning(
+                "%s: has no results to resume (--resume), so that the evaluation begins there%s",
+                self._out,
+                did_you_mean(self._out.name, set(others) - {self._out.name}),
+            )
         if not runs or (not episodes and causes == {"user"}):
             with db:
                 for table in ("attempts", "cells", "policies", "workers", "runs"):

@@ -80,11 +80,11 @@ def public_error(error: Exception, pending: PendingRequest) -> VLAgentsError:
     logger.error(
         "%s failed (session %s, request %s)", request.op, pending.session_id, request.request_id, exc_info=error
     )
-    named = f"server's log has the details under request id {request.request_id}"
-    return PolicyFailed(
-        f"{request.op}: the policy raised {type(error).__name__}{raised_at(error)}; "
-        f"the {named if request.request_id else 'log has the traceback'}"
-    )
+    if request.request_id:
+        details = f"the server's log has the details under request id {request.request_id}"
+    else:
+        details = "the standard error of its process has the traceback"
+    return PolicyFailed(f"{request.op}: the policy raised {type(error).__name__}{raised_at(error)}; {details}")
 
 
 def raised_at(error: Exception) -> str:
