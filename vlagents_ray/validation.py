@@ -72,10 +72,10 @@ def check_action(action: object, contract: Contract | None) -> np.ndarray:
         raise InvalidAction(f"action: got {described(action)}, want (D,) or (H, D) float32") from error
     if array.ndim not in (1, 2) or array.size == 0:
         raise InvalidAction(f"action: got {described(action)}, want (D,) or (H, D) float32")
-    if not _finite(array):
-        raise InvalidAction("action: got NaN or infinity; the policy's output is broken")
     largest = _largest(array)
-    if largest > LARGEST_ACTION:
+    if not largest <= LARGEST_ACTION:
+        if not math.isfinite(largest):
+            raise InvalidAction("action: got NaN or infinity; the policy's output is broken")
         raise InvalidAction(
             f"action: got a number of size {largest:.3g}, want at most {LARGEST_ACTION:g}; "
             f"the policy's output is broken"
@@ -93,9 +93,10 @@ def _finite(array: np.ndarray) -> bool:
 
 
 def _largest(array: np.ndarray) -> float:
-    """Return the largest absolute value."""
+    """Return the largest absolute value; NaN or infinity if there is one."""
     if array.size <= _FEW:
-        return float(max(map(abs, array.ravel().tolist())))
+        values = array.ravel().tolist()
+        return max(map(abs, values)) if all(map(math.isfinite, values)) else math.inf
     return float(np.abs(array).max())
 
 

@@ -252,7 +252,7 @@ MADE = {"env setting negative"}  # mistakes that are found when the environment 
 # In this process, until the policy's error: (policy, parts of the message).
 EPISODES = {
     "WithoutAct": ["act or act_batch"],
-    "WrongKey": ["KeyError", "own.py:", "the standard error of its process has the traceback"],
+    "WrongKey": ["KeyError", "own.py:", "its process wrote the traceback to stderr"],
     "WrongShape": ["(3,)", "4"],
     "NotFinite": ["NaN or infinity"],
     "Enormous": ["size 1e+30", "at most 1e+09"],

@@ -94,7 +94,7 @@ def test_a_deployment_sets_the_limits_as_far_as_clients_read() -> None:
 def test_an_error_in_this_process_names_no_server() -> None:
     pending = PendingRequest("s", Request("act", Obs()), lambda _: None)
     assert str(public_error(RuntimeError("x"), pending)).endswith(
-        "the policy raised RuntimeError; the standard error of its process has the traceback"
+        "the policy raised RuntimeError; its process wrote the traceback to stderr"
     )
 
 

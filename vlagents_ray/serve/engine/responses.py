@@ -83,7 +83,7 @@ def public_error(error: Exception, pending: PendingRequest) -> VLAgentsError:
     if request.request_id:
         details = f"the server's log has the details under request id {request.request_id}"
     else:
-        details = "the standard error of its process has the traceback"
+        details = "its process wrote the traceback to stderr"
     return PolicyFailed(f"{request.op}: the policy raised {type(error).__name__}{raised_at(error)}; {details}")
 
 
