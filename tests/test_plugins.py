@@ -12,7 +12,9 @@ from vlagents_ray import registry
 from vlagents_ray.cli import doctor, robot
 from vlagents_ray.cli.listing import policies_and_wrappers
 from vlagents_ray.cli.main import app
+from vlagents_ray.cli.results import settings_of_export
 from vlagents_ray.errors import ConfigError, UnknownEnv, UnknownPolicy
+from vlagents_ray.evaluate.trackers import tracker_class
 from vlagents_ray.registry import entries, find_entry, names, not_installed, plugin_distributions
 from vlagents_ray.robot.leaders import leader_named
 from vlagents_ray.robot.loop import robot_named
@@ -134,6 +136,30 @@ def test_a_policy_whose_module_raises_is_listed_with_its_error(install: Install,
     assert "out of order" in str(listed.missing)
 
 
+EXPORT = """
+def write(results, path, *, limit: int = 3, columns: list[str]) -> int:
+    return 0
+"""
+
+
+def test_a_format_of_a_plugin_has_the_settings_of_its_function(install: Install, tmp_path: Path) -> None:
+    (tmp_path / "lab_policies" / "export.py").write_text(EXPORT)
+    with (tmp_path / "lab_policies" / "registry.py").open("a") as file:
+        file.write("EXPORT = RegistryEntry('lab_policies.export:write', 'rows of the lab')\n")
+    install("lab-policies", exports="lab = lab_policies.registry:EXPORT")
+    export = registry.registered_function("exports", "lab")
+    assert settings_of_export("lab", export, ["limit=2", "columns=[env]"]) == {"limit": 2, "columns": ["env"]}
+    wrong = {
+        "limt=2": "limt: there is no such setting; want one of .*; did you mean 'limit'",
+        "limit=many": "limit: got 'many', want a valid integer",
+        "columns=env": r"columns: got 'env', want a valid list, such as \[env\]",
+        "limit=2": "columns: is missing; give --set columns=",
+    }
+    for setting, message in wrong.items():
+        with pytest.raises(ConfigError, match=f"--set, for --to lab: (?s:.*){message}"):
+            settings_of_export("lab", export, [setting])
+
+
 def test_a_name_of_two_distributions_is_an_error_that_names_both(install: Install) -> None:
     install("lab-policies", policies="mine = lab_policies.registry:MINE")
     install("other-lab", policies="mine = lab_policies.registry:OTHER")
@@ -142,12 +168,21 @@ def test_a_name_of_two_distributions_is_an_error_that_names_both(install: Instal
 
 
 def test_a_name_of_a_plugin_that_is_not_installed_is_an_error_that_names_it(monkeypatch: pytest.MonkeyPatch) -> None:
-    published = {"envs": {"shelf": "vlagents-ray-shelf"}, "policies": {"pi9": "vlagents-ray-models"}}
+    published = {
+        "envs": {"shelf": "vlagents-ray-shelf"},
+        "policies": {"pi9": "vlagents-ray-models"},
+        "exports": {"hdf9": "vlagents-ray-tables"},
+        "trackers": {"notebook9": "vlagents-ray-tables"},
+    }
     monkeypatch.setattr(registry, "published", lambda: published)
     with pytest.raises(UnknownEnv, match="'shelf' is in vlagents-ray-shelf, which is not installed: pip install"):
         registry.env_class("shelf/top")
     with pytest.raises(UnknownPolicy, match="policy 'pi9' is in vlagents-ray-models"):
         registry.policy_class("pi9")
+    with pytest.raises(ConfigError, match="export format 'hdf9' is in vlagents-ray-tables"):
+        registry.registered_function("exports", "hdf9")
+    with pytest.raises(ConfigError, match="tracker 'notebook9' is in vlagents-ray-tables"):
+        tracker_class("notebook9")
     [listed] = [row for row in policies_and_wrappers() if row.name == "pi9"]
     assert listed.what == "in vlagents-ray-models"
     assert listed.missing == "not installed: pip install vlagents-ray-models"

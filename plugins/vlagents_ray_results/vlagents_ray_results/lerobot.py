@@ -67,7 +67,7 @@ def to_lerobot(
 ) -> int:
     """Write the recorded episodes as a LeRobotDataset v3.0 into the new folder `path`, or write nothing.
 
-    Needs the extra "record". One episode at a time is in memory.
+    One episode at a time is in memory.
 
     A frame is an observation and the action after it; the last observation of an episode is left out. Angles and
     rotation vectors of the state that jump by a full turn are written about another centre. The dataset's contract
@@ -90,64 +90,33 @@ def to_lerobot(
         ConfigError: There is no such trajectory, a file is missing, a camera or part is unknown, or the episodes do not
             fit one dataset.
     """
-    recorded = [(cell, one) for cell in results.cells for one in cell.episodes if one.trajectory is not None]
+    recorded = []
+    for cell in results.cells:
+        recorded += [(cell, episode) for episode in cell.episodes if episode.trajectory is not None]
     if not recorded:
         raise ConfigError(f"{results.out}: has no trajectories; evaluate with --record all (`record: all` in its file)")
     if successes:
-        if not (solved := [(cell, one) for cell, one in recorded if one.result.success_once]):
+        solved = [(cell, episode) for cell, episode in recorded if episode.result.success_once]
+        if not solved:
             raise ConfigError(f"{results.out}: in none of the {len(recorded)} recorded episodes was the task solved")
         recorded = solved
     if path.exists() and any(path.iterdir()):
         raise ConfigError(f"{path}: is there, and not empty; export into a new folder")
-    with_versions = any(one.result.policy_version is not None for _, one in recorded)
     rates = {_fps(cell) for cell, _ in recorded}
     if len(rates) > 1:
         raise ConfigError(f"the envs run at {sorted(rates)} Hz, and a dataset has one rate; {_CURE}")
-
-    def demonstrations() -> Iterator[_Demonstration]:
-        for cell, episode in recorded:
-            path = str(episode.trajectory)
-            trajectory = Trajectory.load(results.file(path))
-            parts = parts_of(trajectory.state, trajectory.gripper is not None)
-            numbers = [part for part in parts if part != GRIPPER or trajectory.gripper is None]
-            environment = _chosen("environment_state", environment_state, numbers, cell.env)
-            others = [part for part in parts if part not in environment]
-            chosen = _chosen("state", others if state is None else state, parts, cell.env)
-            shown = _chosen("cameras", cameras, trajectory.cameras, cell.env)
-            videos = videos_of(Path(path), trajectory.cameras)
-            with_gripper = trajectory.gripper is not None and GRIPPER in chosen
-            named = {*chosen, *environment} - ({GRIPPER} if with_gripper else set())
-            kept = {part: values for part, values in trajectory.state.items() if part in named}
-            gripper = trajectory.gripper if with_gripper else None
-            frames = len(trajectory.actions)
-            if cut_idle:
-                moving = [trajectory.actions, *kept.values(), *([] if gripper is None else [gripper[:, np.newaxis]])]
-                frames = _frames_until_rest(trajectory.success, moving)
-            one = _Demonstration(
-                cell,
-                episode,
-                Contract.from_json(cell.contract),
-                trajectory.actions[:frames],
-                trajectory.rewards[:frames],
-                trajectory.success[:frames],
-                tuple(chosen),
-                tuple(environment),
-                {part: values[:frames] for part, values in kept.items()},
-                None if gripper is None else gripper[:frames],
-                trajectory.versions[:frames] if with_versions else None,
-                {camera: require_there(results.file(str(videos[camera]))) for camera in shown},
-            )
-            if frames:  # a policy that failed before it acted leaves an empty episode
-                yield one
-
-    angles = _angles(demonstrations())
+    with_versions = any(episode.result.policy_version is not None for _, episode in recorded)
+    selection = _Selection(results, cameras, state, environment_state, cut_idle, with_versions)
+    angles = _angles(selection.demonstrations(recorded))
     with _new_folder(path) as root:
         dataset = Dataset(root, rates.pop(), durable=False)
-        for one in demonstrations():
-            finished = _finished(one, angles, root / UNFINISHED)
-            if dataset.episodes and finished.features != dataset.info["features"]:
-                odd = sorted(k for k, v in finished.features.items() if dataset.info["features"].get(k) != v)
-                raise ConfigError(f"{one.cell.env}: has other features than envs before ({', '.join(odd)}); {_CURE}")
+        for demonstration in selection.demonstrations(recorded):
+            finished = _finished(demonstration, angles, root / UNFINISHED)
+            features = dataset.info["features"]
+            if dataset.episodes and finished.features != features:
+                differing = sorted(key for key, value in finished.features.items() if features.get(key) != value)
+                env = demonstration.cell.env
+                raise ConfigError(f"{env}: has other features than envs before ({', '.join(differing)}); {_CURE}")
             dataset.save(finished)
         if not dataset.episodes:
             raise ConfigError(f"{results.out}: in none of the {len(recorded)} recorded episodes did the policy act")
@@ -176,6 +145,63 @@ class _Demonstration:
     gripper: np.ndarray | None  # (N,)
     versions: np.ndarray | None  # (N,) of the weights that chose each action; None if no episode's policy named them
     videos: dict[str, Path]  # by camera
+
+
+@dataclass(frozen=True, slots=True)
+class _Selection:
+    """The cameras, parts of the state and frames of recorded episodes that go into the dataset."""
+
+    results: Results
+    cameras: Sequence[str] | None
+    state: Sequence[str] | None
+    environment_state: Sequence[str]
+    cut_idle: bool
+    with_versions: bool  # of the weights
+
+    def demonstrations(self, recorded: Iterable[tuple[CellResults, Episode]]) -> Iterator[_Demonstration]:
+        """Read one recorded episode after the other; an episode without frames is left out."""
+        for cell, episode in recorded:
+            demonstration = self._read(cell, episode)
+            if len(demonstration.actions):  # a policy that failed before it acted leaves an empty episode
+                yield demonstration
+
+    def _read(self, cell: CellResults, episode: Episode) -> _Demonstration:
+        path = str(episode.trajectory)
+        trajectory = Trajectory.load(self.results.file(path))
+        parts = parts_of(trajectory.state, trajectory.gripper is not None)
+        numbers = [part for part in parts if part != GRIPPER or trajectory.gripper is None]
+        environment = _chosen("environment_state", self.environment_state, numbers, cell.env)
+        others = [part for part in parts if part not in environment]
+        chosen = _chosen("state", others if self.state is None else self.state, parts, cell.env)
+        cameras = _chosen("cameras", self.cameras, trajectory.cameras, cell.env)
+        videos = videos_of(Path(path), trajectory.cameras)
+
+        gripper = trajectory.gripper if GRIPPER in chosen else None
+        in_state = {*chosen, *environment}
+        if gripper is not None:
+            in_state.remove(GRIPPER)
+        state = {part: values for part, values in trajectory.state.items() if part in in_state}
+        frames = len(trajectory.actions)
+        if self.cut_idle:
+            moving = [trajectory.actions, *state.values()]
+            if gripper is not None:
+                moving.append(gripper[:, np.newaxis])
+            frames = _frames_until_rest(trajectory.success, moving)
+
+        return _Demonstration(
+            cell,
+            episode,
+            Contract.from_json(cell.contract),
+            trajectory.actions[:frames],
+            trajectory.rewards[:frames],
+            trajectory.success[:frames],
+            tuple(chosen),
+            tuple(environment),
+            {part: values[:frames] for part, values in state.items()},
+            None if gripper is None else gripper[:frames],
+            trajectory.versions[:frames] if self.with_versions else None,
+            {camera: require_there(self.results.file(str(videos[camera]))) for camera in cameras},
+        )
 
 
 @contextmanager
