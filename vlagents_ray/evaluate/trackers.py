@@ -15,8 +15,8 @@ from vlagents_ray.evaluate.artifacts.storage import PROVENANCE
 from vlagents_ray.evaluate.plan.config import EvalConfig, fingerprint
 from vlagents_ray.evaluate.results.changes import IDENTITY
 from vlagents_ray.evaluate.results.database import FILE, WAIT_S
-from vlagents_ray.evaluate.results.reader import Results
-from vlagents_ray.evaluate.results.summary import summarize
+from vlagents_ray.evaluate.results.reader import CellResults, Results
+from vlagents_ray.evaluate.results.summary import Group, summarize
 from vlagents_ray.registry import registered_class, require_needs
 
 log = logging.getLogger(__name__)
@@ -121,31 +121,37 @@ class TrackerFeed:
                 log.warning("%s: %s: %s", name, type(error).__name__, error)
 
     def _log_to(self, name: str, results: Results) -> None:
+        """Log the complete cells, and then the complete policies, of which the tracker has other numbers or none."""
+        summary = summarize(results)
+        groups = [(cell.cell, [cell], group) for cell, group in zip(results.cells, summary.cells, strict=True)]
+        for policy, total in zip(results.contenders, summary.totals, strict=True):
+            groups.append((policy, results.of(policy), total))
         with closing(sqlite3.connect(self._config.out / FILE, timeout=WAIT_S)) as db:
             logged = dict(db.execute("SELECT what, episodes FROM tracked WHERE tracker = ?", (name,)))
-            summary, policies = summarize(results), results.contenders
-            parts = [(one.cell, [one], group) for one, group in zip(results.cells, summary.cells, strict=True)]
-            parts += [(one, results.of(one), group) for one, group in zip(policies, summary.totals, strict=True)]
-            for part, cells, group in parts:  # each cell, then each policy id
-                over = all(
-                    cell.stopped_at is not None or sum(not one.beyond for one in cell.episodes) >= cell.planned
-                    for cell in cells
-                )
-                if not over or logged.get(part) == group.episodes:
+            for identity, cells, group in groups:
+                if not all(map(_is_complete, cells)) or logged.get(identity) == group.episodes:
                     continue
-                policy = cells[0].policy
-                if (run := self._runs.get((name, policy))) is None:
-                    run = self._runs[name, policy] = self._classes[name](self._subject(results, policy))
-                rates = {"success_once": group.success_once.rate, "success_at_end": group.success_at_end.rate}
-                values = rates | {"return": group.mean_return, "steps": group.mean_steps, "episodes": group.episodes}
+                run = self._run_of(name, results, cells[0].policy)
                 label = "/".join(filter(None, (group.suite, group.env)))
-                run.log({f"{label}/{k}": float(v) for k, v in values.items() if v is not None}, cells[0].step)
-                ordered = sorted(cells[0].episodes, key=lambda one: bool(one.result.success_once))
-                paths = [self._config.out / path for one in ordered for path in one.videos[:1]]
-                if part == cells[0].cell and (videos := paths[: self._config.tracking.videos]):
-                    run.videos(label, videos, cells[0].step)
+                run.log(_metrics(label, group), cells[0].step)
+                if identity == cells[0].cell:
+                    videos = self._videos(cells[0])
+                    if videos:
+                        run.videos(label, videos, cells[0].step)
                 with db:
-                    db.execute("INSERT OR REPLACE INTO tracked VALUES (?, ?, ?)", (name, part, group.episodes))
+                    db.execute("INSERT OR REPLACE INTO tracked VALUES (?, ?, ?)", (name, identity, group.episodes))
+
+    def _run_of(self, name: str, results: Results, policy: str) -> TrackerRun:
+        run = self._runs.get((name, policy))
+        if run is None:
+            run = self._runs[name, policy] = self._classes[name](self._subject(results, policy))
+        return run
+
+    def _videos(self, cell: CellResults) -> list[Path]:
+        """Return the first videos of a cell that are shown, failures first."""
+        ordered = sorted(cell.episodes, key=lambda episode: bool(episode.result.success_once))
+        videos = [self._config.out / path for episode in ordered for path in episode.videos[:1]]
+        return videos[: self._config.tracking.videos]
 
     def _subject(self, results: Results, policy: str) -> TrackedPolicy:
         out, names = self._config.out, self._config.tracking
@@ -160,3 +166,21 @@ class TrackerFeed:
             {"evaluation": results.runs[-1].config, "served": served, "code": code},
             sorted((out / PROVENANCE).glob("*.diff")),
         )  # fmt: skip
+
+
+def _is_complete(cell: CellResults) -> bool:
+    if cell.stopped_at is not None:
+        return True
+    return sum(not episode.beyond for episode in cell.episodes) >= cell.planned
+
+
+def _metrics(label: str, group: Group) -> dict[str, float]:
+    """Return what is known of a group by the names of its curves."""
+    values = {
+        "success_once": group.success_once.rate,
+        "success_at_end": group.success_at_end.rate,
+        "return": group.mean_return,
+        "steps": group.mean_steps,
+        "episodes": group.episodes,
+    }
+    return {f"{label}/{name}": float(value) for name, value in values.items() if value is not None}
