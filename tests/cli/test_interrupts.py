@@ -73,7 +73,10 @@ class Acting(Policy):
 class Close(Policy):
     hangs_in = "close"
 """
-WITH_RAY = [pytest.mark.ray, pytest.mark.slow]
+SIGNALS = [signal.SIGINT, signal.SIGTERM]
+WITHOUT_RAY = [("Initialize", 0), ("Reset", HANGS_AFTER), ("Acting", HANGS_AFTER), ("Close", EPISODES)]
+CASES = [(policy, "0", finished, number) for policy, finished in WITHOUT_RAY for number in SIGNALS]
+WITH_RAY = pytest.param("Acting", "1", HANGS_AFTER, signal.SIGTERM, marks=[pytest.mark.ray, pytest.mark.slow])
 
 
 def interrupted(words: list[str], number: signal.Signals, folder: Path) -> tuple[int, str]:
@@ -97,17 +100,7 @@ def interrupted(words: list[str], number: signal.Signals, folder: Path) -> tuple
     return command.returncode, printed
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-@pytest.mark.parametrize(
-    ("policy", "workers", "finished"),
-    [
-        ("Initialize", "0", 0),
-        ("Reset", "0", HANGS_AFTER),
-        ("Acting", "0", HANGS_AFTER),
-        ("Close", "0", EPISODES),
-        pytest.param("Acting", "1", HANGS_AFTER, marks=WITH_RAY),
-    ],
-)
+@pytest.mark.parametrize(("policy", "workers", "finished", "number"), [*CASES, WITH_RAY])
 def test_one_signal_ends_an_evaluation_that_hangs(
     policy: str, workers: str, finished: int, number: signal.Signals, tmp_path: Path
 ) -> None:
@@ -148,7 +141,7 @@ class Observing:
 """
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize("number", SIGNALS)
 @pytest.mark.parametrize(("arm", "stops"), [("Starting", False), ("Observing", True)])
 def test_one_signal_ends_a_check_of_a_robot_that_hangs(
     arm: str, stops: bool, number: signal.Signals, tmp_path: Path

@@ -24,8 +24,7 @@ SERIES = "ray_vlagents_sessions"
 QUEUE_LENGTH_S = {"RAY_SERVE_QUEUE_LENGTH_RESPONSE_DEADLINE_S": "60"}
 
 
-@pytest.mark.parametrize("to_the_group", [True, False], ids=["group", "process"])
-def test_two_replicas_start_and_stop_in_silence(to_the_group: bool, tmp_path: Path) -> None:
+def test_two_replicas_start_and_stop_in_silence(tmp_path: Path) -> None:
     application = {"import_path": IMPORT_PATH, "args": {"policy": "noop", "replicas": 2}}
     (tmp_path / "two.yaml").write_text(yaml.safe_dump({"applications": [application]}))
     port = free_address().rpartition(":")[2]
@@ -46,7 +45,7 @@ def test_two_replicas_start_and_stop_in_silence(to_the_group: bool, tmp_path: Pa
         [url] = re.findall(r"^metrics for Prometheus: (http://\S+)$", log.read_text(), re.MULTILINE)
         wait_for(lambda: SERIES in metrics(url), START_S)
     finally:
-        (os.killpg if to_the_group else os.kill)(server.pid, signal.SIGTERM)
+        server.send_signal(signal.SIGTERM)
         server.wait(START_S)
     printed = log.read_text()
     assert server.returncode == 0, printed

@@ -76,16 +76,17 @@ def test_kill_dash_nine_and_resume_leave_each_episode_once(ray_home: Path, tmp_p
     refused = evaluate(ray_home, *words)
     assert refused.returncode == 2
     assert "--resume" in refused.stderr
-    done = evaluate(ray_home, *words, "--resume")
+    done = evaluate(ray_home, *words, "--workers", "0", "--resume")
     assert done.returncode == 0, done.stderr
     after = rows(out)
     assert [row[1] for row in after] == list(range(60))
     assert set(before) <= set(after)
 
 
-def test_results_without_workers_are_those_with_them_and_each_resumes_the_other(ray_home: Path, tmp_path: Path) -> None:
+def test_results_without_workers_are_those_with_them_which_resume_them(ray_home: Path, tmp_path: Path) -> None:
+    """The test above resumes without workers what was begun with them."""
     words = ["tabletop", "tabletop/stack", "--policy", "scripted", "--video", "none", "--out"]
-    orders = {"whole": ["0"], "there": ["0", "2"], "back": ["2", "0"]}
+    orders = {"whole": ["0"], "resumed": ["0", "2"]}
     for name, order in orders.items():
         for number, workers in enumerate(order):
             episodes = "4" if number == len(order) - 1 else "2"
@@ -99,8 +100,8 @@ def test_results_without_workers_are_those_with_them_and_each_resumes_the_other(
         results = Results.load(tmp_path / name)
         found[name] = [one.result.outcome for cell in results.cells for one in cell.episodes]
         assert len(found[name]) == 8
-    assert found["whole"] == found["there"] == found["back"]
-    policies = [Results.load(tmp_path / name).policies["scripted"] for name in ("whole", "there")]
+    assert found["whole"] == found["resumed"]
+    policies = [Results.load(tmp_path / name).policies["scripted"] for name in orders]
     ours, theirs = ({key: one.get(key) for key in ("policy", "config", "contract", "program")} for one in policies)
     assert ours == theirs
 

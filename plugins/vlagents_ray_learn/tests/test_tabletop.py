@@ -209,13 +209,13 @@ def test_there_is_an_example_of_each_method() -> None:
 
 SMALL = {
     "methods": ["bc", "rpd"],  # a learner of groups goes through it at the end of this file
-    "demonstrations": 8,
-    "clone_steps": 300,
+    "demonstrations": 4,
+    "clone_steps": 100,
     "iterations": 2,
-    "episodes": 8,
-    "steps": 50,
+    "episodes": 4,
+    "steps": 20,
     "evaluate_every": 2,
-    "held_out": 6,
+    "held_out": 2,
     "num_envs": 4,
 }
 
@@ -228,9 +228,9 @@ def test_a_small_run_ends_with_a_table_of_each_method(tmp_path: Path) -> None:
         (folder / "plan.yaml").write_text(json.dumps(SMALL))
         with start_run(folder, out) as run:
             printed = ended(run, folder)
-    assert "demonstrations: 8 of 8 episodes solved" in printed
+    assert "demonstrations: 4 of 4 episodes solved" in printed
     assert (out / "report.html").is_file()
-    assert list(table(out)) == ["bc@300", "rpd@400"]
+    assert list(table(out)) == ["bc@100", "rpd@140"]
 
 
 STEPS = 6  # of an episode
