@@ -44,7 +44,14 @@ class OpenLeader(Protocol):
 
 
 def leader_named(option: str, name: str) -> OpenLeader:
-    """Return what opens a device by its name: a registered one, or a class "module:Class" made without arguments.
+    """Return the function that opens an operator's device.
+
+    Args:
+        option: The option that names the device, such as "--leader", for errors.
+        name: A registered name, such as "keyboard", or a class "module:Class" that is made without arguments.
+
+    Returns:
+        The function, which opens the device for a contract.
 
     Raises:
         ConfigError: There is no such device, or the class lacks a method of `Leader`.

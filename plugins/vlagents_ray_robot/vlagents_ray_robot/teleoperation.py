@@ -295,7 +295,16 @@ class SpaceMouse(AxesDevice):
 def open_keyboard(
     contract: Contract | None, *, step: float | None = None, measure: Callable[[Obs], np.ndarray] | None = None
 ) -> Iterator[Leader]:
-    """Yield the keys of the terminal as a leader; arguments as of `AxesLeader`."""
+    """Open the keys of the terminal as a leader.
+
+    Args:
+        contract: The contract of the policy or the environment.
+        step: The change of a number of the action at a tick with an axis at its end; None: by the contract.
+        measure: Returns the robot's measured pose, (D,), in an observation; None: the state's part `joints`.
+
+    Yields:
+        The leader, an `AxesLeader`.
+    """
     with Keyboard() as device:
         yield AxesLeader(contract, device, step=step, measure=measure)
 
@@ -304,6 +313,15 @@ def open_keyboard(
 def open_spacemouse(
     contract: Contract | None, *, step: float | None = None, measure: Callable[[Obs], np.ndarray] | None = None
 ) -> Iterator[Leader]:
-    """Yield a SpaceMouse as a leader; arguments as of `AxesLeader`."""
+    """Open a SpaceMouse as a leader.
+
+    Args:
+        contract: The contract of the policy or the environment.
+        step: The change of a number of the action at a tick with an axis at its end; None: by the contract.
+        measure: Returns the robot's measured pose, (D,), in an observation; None: the state's part `joints`.
+
+    Yields:
+        The leader, an `AxesLeader`.
+    """
     with SpaceMouse() as device:
         yield AxesLeader(contract, device, step=step, measure=measure)
