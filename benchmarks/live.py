@@ -40,9 +40,9 @@ from vlagents_ray.policies.noop import Noop
 from vlagents_ray.serve.engine import sender
 from vlagents_ray.serve.launch.deployment_file import deployment
 from vlagents_ray.serve.launch.server import running_server
-from vlagents_ray.serve.observers.live import LEASE_S
 from vlagents_ray.serve.python_env.child_start import die_with_parent, own_stdout
 from vlagents_ray_cluster.tune.line_process import LineProcess, our_environment
+from vlagents_ray_live.live import LEASE_S
 
 ABSENT, NOBODY, RING = "tap absent", "nobody", "nobody, 30 s held"
 HZ, SATURATED_HZ = 50.0, 1e9
@@ -122,7 +122,7 @@ def measure_live(
         made = {
             "tapped": deployment("benchmarks.live:Measured", config=_CONFIG),
             "untapped": deployment("benchmarks.live:Untapped", config=_CONFIG),
-            "holding": deployment("benchmarks.live:Measured", config=_CONFIG, live={"folder": folder}),
+            "holding": deployment("benchmarks.live:Measured", config=_CONFIG, parts={"live": {"folder": folder}}),
         }
         apps = [one.applications[0] for one in made.values()]
         for name, one in zip(made, apps, strict=True):

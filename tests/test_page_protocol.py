@@ -14,7 +14,7 @@ import pytest
 from vlagents_ray import page_protocol
 from vlagents_ray.evaluate.robot.operator import PageOperator
 from vlagents_ray.serve.access.api_keys import Keys
-from vlagents_ray.serve.observers.live_page import page_server
+from vlagents_ray_live.live_page import page_server
 
 HALF_A_HEADER = b"GET /live HTTP/1.1\r\nHost: 127.0.0.1\r\n"
 KEYS = '{"keys": [{"name": "viewer", "sha256": "' + "0" * 64 + '"}]}'

@@ -2,9 +2,9 @@
 
 A name leads to a `RegistryEntry`, whose class is imported only when it is used. Plug-ins add entries through the
 entry-point groups `vlagents_ray.policies`, `.wrappers`, `.envs`, `.dialects`, `.robots`, `.leaders`, `.commands`,
-`.replica`, `.exports` and `.trackers`: an entry point names a `RegistryEntry` in a module that imports nothing large. A
-`"module:Class"` in a deployment file works without registration. Wrappers change the observations of any policy, or its
-actions.
+`.replica`, `.pages`, `.exports` and `.trackers`: an entry point names a `RegistryEntry` in a module that imports
+nothing large. A `"module:Class"` in a deployment file works without registration. Wrappers change the observations of
+any policy, or its actions.
 
 The tables of README and docs/ are made from these entries: `python tests/support/tables.py`.
 """
@@ -51,6 +51,7 @@ class RegistryEntry:
     weights: bool = False  # whether a checkout has weights of it, which deployments/NAME.yaml names
     # A URL, or "page#section" below docs/policies or docs/benchmarks; "": no page; None: the page of its own name.
     page: str | None = None
+    by_default: bool = False  # of a part of a replica: whether it is on in each server, with its default settings
     distribution: str = CORE  # that registers it; of a plug-in, the name of its entry point's distribution
 
 
@@ -116,6 +117,7 @@ _BUILT_IN: dict[str, dict[str, RegistryEntry]] = {
     "leaders": {},  # operators' devices, `vlagents-ray robot --leader NAME`
     "commands": {},  # those of this package are in `cli.main`; "robot.NAME" is a subcommand of `vlagents-ray robot`
     "replica": {},  # parts of a replica
+    "pages": {},  # that show an evaluation while it runs
     "exports": EXPORTS,
     "trackers": {},  # classes like `evaluate.trackers.TrackerRun`
 }
@@ -128,6 +130,7 @@ _SINGULAR = {
     "leaders": "leader",
     "commands": "command",
     "replica": "part of a replica",
+    "pages": "page of evaluations",
     "exports": "export format",
     "trackers": "tracker",
 }

@@ -18,6 +18,7 @@ from eval_fakes import LINE, OTHER_LINE
 from in_process_evaluation import flat_config, play
 from typer.testing import CliRunner
 
+from vlagents_ray import registry
 from vlagents_ray.cli import evaluate as command
 from vlagents_ray.cli import evaluation as run
 from vlagents_ray.cli.evaluation import forecasts, live_address, print_plan
@@ -184,6 +185,18 @@ def test_options_that_cannot_hold_are_refused_before_anything_starts(
     words: list[str], text: str, tmp_path: Path
 ) -> None:
     assert text in said("eval", "tabletop", "--policy", "scripted", "--out", str(tmp_path / "out"), *words)
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize("words", [["--live"], ["--live-at", "127.0.0.1:8050"]])
+@pytest.mark.usefixtures("no_server")
+def test_a_page_whose_plugin_is_not_installed_is_named_before_anything_starts(
+    monkeypatch: pytest.MonkeyPatch, words: list[str], tmp_path: Path
+) -> None:
+    monkeypatch.setattr(registry, "_entry_points", lambda _: {})
+    message = said("eval", "tabletop", "--policy", "scripted", "--out", str(tmp_path / "out"), *words)
+    assert "page of evaluations 'live' is in vlagents-ray-live, which is not installed" in message
+    assert "pip install vlagents-ray-live" in message
     assert not (tmp_path / "out").exists()
 
 

@@ -35,7 +35,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def server(shared_ray: None, folder: Path) -> Iterator[Server]:
-    with serving(POLICY, record={"folder": str(folder)}) as server:
+    with serving(POLICY, parts={"record": {"folder": str(folder)}}) as server:
         yield server
 
 

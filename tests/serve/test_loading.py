@@ -20,7 +20,6 @@ from vlagents_ray.serve.access.key_store import new_key
 from vlagents_ray.serve.app import application
 from vlagents_ray.serve.config.deployment import ServerArgs
 from vlagents_ray.serve.launch.deployment_file import IMPORT_PATH
-from vlagents_ray.serve.observers.live_view import ReplicaView
 from vlagents_ray.serve.ports import HOST
 from vlagents_ray.serve.replica import replica as module
 from vlagents_ray.serve.replica.replica import PolicyReplica
@@ -140,7 +139,7 @@ def test_a_replica_warns_of_keys_that_come_unencrypted_unless_tls_ends_elsewhere
 @pytest.mark.parametrize("method", PEER_METHODS)
 def test_what_other_replicas_call_reaches_the_part_that_has_it(monkeypatch: pytest.MonkeyPatch, method: str) -> None:
     asked = PEER_METHODS[method]
-    parts = {part: SimpleNamespace() for part in (HeldSessions, WeightUpdates, ReplicaView, Rebalancer)}
+    parts = {part: SimpleNamespace() for part in (HeldSessions, WeightUpdates, Rebalancer)}
 
     async def later(part: object, *args: object) -> object:
         return part, args
@@ -151,7 +150,6 @@ def test_what_other_replicas_call_reaches_the_part_that_has_it(monkeypatch: pyte
     vars(one).update(
         _migrator=SimpleNamespace(held=parts[HeldSessions]),
         _weights=ThisReplica("this", parts[WeightUpdates]),  # type: ignore[arg-type]
-        _observers=SimpleNamespace(view=parts[ReplicaView]),
         _rebalancer=parts[Rebalancer],
     )
     args = () if asked.part is Rebalancer else (1, "two")
@@ -170,7 +168,7 @@ def test_other_replicas_call_a_part_by_its_name() -> None:
     assert asyncio.run(one.call_part("counter", "count", 1, "two")) == ("counter", "count", (1, "two"))
 
 
-def test_a_replica_answers_what_waits_before_its_ways_in_and_its_observers_close() -> None:
+def test_a_replica_answers_what_waits_before_its_ways_in_and_its_parts_close() -> None:
     closed: list[str] = []
 
     def part(name: str, **more: Any) -> Any:
@@ -185,11 +183,11 @@ def test_a_replica_answers_what_waits_before_its_ways_in_and_its_observers_close
             _tasks=[asyncio.ensure_future(asyncio.sleep(60))],
             _engine=part("engine", draining=True),
             _migrator=SimpleNamespace(hand_over=lambda: ended("sessions"), close=lambda: ended("migrator")),
-            **{f"_{name}": part(name) for name in ("parts", "observers", "metrics", "local", "stream")},
+            **{f"_{name}": part(name) for name in ("parts", "metrics", "local", "stream")},
             _plasma=None,
         )
         await one.close()
         assert await asyncio.gather(*one._tasks, return_exceptions=True)
 
     asyncio.run(close())
-    assert closed == ["sessions", "migrator", "engine", "local", "stream", "parts", "observers", "metrics"]
+    assert closed == ["sessions", "migrator", "engine", "local", "stream", "parts", "metrics"]

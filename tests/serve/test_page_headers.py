@@ -15,8 +15,8 @@ from live_server import live_server
 
 import vlagents_ray
 from vlagents_ray.evaluate.robot.operator import PageOperator
-from vlagents_ray.serve.observers.live_page import page_server
-from vlagents_ray.serve.observers.live_view import Fleet
+from vlagents_ray_live.live_page import page_server
+from vlagents_ray_live.live_view import Fleet
 
 PACKAGE = Path(vlagents_ray.__file__).parent
 SERVES = {"evaluate/robot/operator.py", "serve/endpoints/http_messages.py"}  # all modules that send HTML

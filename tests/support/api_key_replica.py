@@ -53,6 +53,7 @@ from vlagents_ray.registry import dialect_class
 from vlagents_ray.serve import periodic
 from vlagents_ray.serve.access import api_keys
 from vlagents_ray.serve.config.dialects import DialectArgs
+from vlagents_ray.serve.config.parts import PartArgs
 from vlagents_ray.serve.dialects.base import GatewayContext, ReplicaContext, dialect_routes
 from vlagents_ray.serve.endpoints import access_middleware, websocket
 from vlagents_ray.serve.endpoints.access_middleware import AccessMiddleware
@@ -62,9 +63,8 @@ from vlagents_ray.serve.endpoints.shm import ShmServer
 from vlagents_ray.serve.endpoints.websocket import WebSocketServer
 from vlagents_ray.serve.endpoints.weights import weights_routes
 from vlagents_ray.serve.engine.engine import Engine
-from vlagents_ray.serve.observers.live_page import live_routes
-from vlagents_ray.serve.observers.live_view import Fleet, ReplicaView
 from vlagents_ray.serve.ports import free_port, reserve
+from vlagents_ray.serve.replica.part import PartContext, open_parts
 from vlagents_ray.serve.weights import PushResult
 from vlagents_ray.weights.safetensors import ValueSpec, header_of, read_header
 from vlagents_ray_dialects.messages import vla_eval as vla_eval_codec
@@ -170,12 +170,14 @@ class KeyedReplica:
         self.engine.start()
         routes = dialect_routes(DialectArgs(**ALL), ReplicaContext(self.engine, lambda: METADATA, LIMITS))
         metadata = METADATA | {"policy_version": None, "weights": None}
-        view = ReplicaView(self.engine, "this", "here", lambda: metadata)
-        live = live_routes(Fleet(view), open_to_network=False)
-        others = [*weights_routes(_Receiving(self), 30.0, open_to_network=False), *live]
+        parts = open_parts(PartArgs(), PartContext(self.engine, "this", "here", lambda: metadata))
+        stack.callback(parts.close)
+        others = [*weights_routes(_Receiving(self), 30.0, open_to_network=False), *parts.routes()]
         inside = build_http_app(self.engine, lambda: METADATA, LIMITS, more=[*routes, *others])
         self.routes = inside.routes
-        with_access = AccessMiddleware(inside, self.known.keys, "app", admission=self.engine.admission)
+        with_access = AccessMiddleware(
+            inside, self.known.keys, "app", admission=self.engine.admission, public=parts.pages()
+        )
         self.port = stack.enter_context(served(FrontMiddleware(with_access)))
         check = partial(self.at_gateway.check, app="app")
         self.gr00t = {near: self._on_own_port(stack, "gr00t", near, check) for near in (True, False)}

@@ -67,8 +67,6 @@ from vlagents_ray.serve.endpoints.websocket import WebSocketServer
 from vlagents_ray.serve.engine.admission import Admission
 from vlagents_ray.serve.engine.engine import Engine
 from vlagents_ray.serve.launch.haproxy import haproxy_binary, ingress_environment
-from vlagents_ray.serve.observers.live_page import page_server
-from vlagents_ray.serve.observers.live_view import Fleet
 from vlagents_ray.serve.ports import free_port, reserve
 from vlagents_ray.wire import json_numpy
 from vlagents_ray_dialects import gr00t, vlagents
@@ -77,6 +75,8 @@ from vlagents_ray_dialects.messages import gr00t as gr00t_wire
 from vlagents_ray_dialects.messages import lerobot, rpyc, zmtp
 from vlagents_ray_dialects.messages import openpi as openpi_codec
 from vlagents_ray_dialects.messages import vla_eval as vla_eval_codec
+from vlagents_ray_live.live_page import page_server
+from vlagents_ray_live.live_view import Fleet
 
 HEIGHT, WIDTH = 2304, 4096  # of the largest image
 GATEWAYS_IN_FLIGHT = 256 * 2**20  # bytes; a key or an address may take half of it

@@ -6,10 +6,10 @@ import json
 import struct
 import urllib.error
 import urllib.request
-from collections.abc import Iterator, Sequence
+from collections.abc import Awaitable, Callable, Iterator, Sequence
 from contextlib import ExitStack, closing, contextmanager, suppress
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, TypeVar
 
 from asgi_server import served
 
@@ -19,14 +19,17 @@ from vlagents_ray.interface import Agent
 from vlagents_ray.policies.noop import Noop
 from vlagents_ray.protocol.messages import DEFAULT_LIMITS, PROTOCOL_VERSION
 from vlagents_ray.serve.access.api_keys import Keys
-from vlagents_ray.serve.config.deployment import LiveArgs, ServerArgs
+from vlagents_ray.serve.config.parts import PartArgs
 from vlagents_ray.serve.endpoints.access_middleware import AccessMiddleware
 from vlagents_ray.serve.endpoints.http import build_http_app
 from vlagents_ray.serve.engine.engine import Engine
-from vlagents_ray.serve.observers.live_page import live_routes
-from vlagents_ray.serve.observers.live_view import Fleet, OtherReplicas, ReplicaView
-from vlagents_ray.serve.observers.opening import open_observers
 from vlagents_ray.serve.ports import free_port
+from vlagents_ray.serve.replica.part import OtherReplica, PartContext, ReplicaParts, no_siblings, open_parts
+from vlagents_ray_live.live_view import Fleet, ReplicaView
+from vlagents_ray_live.part import LivePart
+from vlagents_ray_live.ring import LiveConfig
+
+Part = TypeVar("Part")
 
 METADATA = {
     "policy": "noop",
@@ -98,24 +101,36 @@ class LiveServer:
 def live_server(
     agent: Agent | None = None,
     keys: Keys | None = None,
-    others: OtherReplicas | None = None,
+    siblings: Callable[[], Awaitable[Sequence[OtherReplica]]] = no_siblings,
     *,
     insecure: bool = False,
-    settings: LiveArgs | None = None,
+    settings: LiveConfig | None = None,
 ) -> Iterator[LiveServer]:
-    """A replica of `agent`, by default `noop`, until the end of the context."""
+    """A replica of `agent`, by default `noop`, with the parts that are on by default, until the end of the context."""
     engine = Engine(agent or Noop.from_config({}))
     engine.start()
-    args = ServerArgs(policy="noop", live=settings)
-    observers = open_observers(engine, args, "SERVE_REPLICA::app#Policy#this", "here", lambda: METADATA)
-    view = observers.view
-    fleet = Fleet(view, others)
-    routes = live_routes(fleet, open_to_network=insecure)
-    inside = build_http_app(engine, lambda: METADATA, DEFAULT_LIMITS, more=routes)
+    context = PartContext(
+        engine,
+        "SERVE_REPLICA::app#Policy#this",
+        "here",
+        lambda: METADATA,
+        open_to_network=insecure,
+        siblings=siblings,
+    )
+    parts = open_parts(PartArgs(**({} if settings is None else {"live": settings})), context)
+    live = part_of(parts, LivePart)
+    inside = build_http_app(engine, lambda: METADATA, DEFAULT_LIMITS, more=list(parts.routes()))
     with ExitStack() as stack:
-        stack.callback(observers.close)
+        stack.callback(parts.close)
         stack.callback(engine.close)
-        yield LiveServer(engine, view, fleet, stack.enter_context(served(AccessMiddleware(inside, keys, "app"))))
+        port = stack.enter_context(served(AccessMiddleware(inside, keys, "app", public=parts.pages())))
+        yield LiveServer(engine, live.view, live.fleet, port)
+
+
+def part_of(parts: ReplicaParts, kind: type[Part]) -> Part:
+    """The one part of that class."""
+    [found] = [part for part in parts._parts.values() if isinstance(part, kind)]
+    return found
 
 
 def ask(socket: ProxiedSocket, shown: Sequence[str] = ()) -> tuple[dict[str, Any], list[bytes]]:

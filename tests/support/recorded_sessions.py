@@ -17,11 +17,10 @@ from vlagents_ray.contract import ActionSpec, Contract
 from vlagents_ray.interface import Act, Agent, Obs
 from vlagents_ray.protocol.messages import Reply, Request
 from vlagents_ray.serve.access.api_keys import NoKey
-from vlagents_ray.serve.config.deployment import RecordArgs, ServerArgs
 from vlagents_ray.serve.engine.engine import Engine
 from vlagents_ray.serve.engine.sender import Sender
-from vlagents_ray.serve.observers.opening import open_observers
-from vlagents_ray.serve.observers.recording import SessionRecorder
+from vlagents_ray.serve.replica.part import PartContext
+from vlagents_ray_live.recording import RecordConfig, Recording, SessionRecorder
 
 HEIGHT, WIDTH = 33, 48
 
@@ -96,7 +95,7 @@ def seen(i: int, side: int = WIDTH) -> Obs:
 
 @contextmanager
 def recorded(folder: Path, agent: Agent | None = None, **settings: Any) -> Iterator[Recorded]:
-    """A replica that records as `record:` with these settings says."""
+    """A replica that records as `parts: {record: ...}` with these settings says."""
     engine = Engine(agent or Brightness())
     engine.start()
 
@@ -104,11 +103,14 @@ def recorded(folder: Path, agent: Agent | None = None, **settings: Any) -> Itera
         assert engine.contract is not None
         return {"policy": "brightness", "contract": engine.contract.to_json()}
 
-    args = ServerArgs(policy="noop", record=RecordArgs(folder=str(folder), **settings))
-    observers = open_observers(engine, args, "SERVE_REPLICA::app#Policy#a1", "here", metadata)
-    assert observers.recorder is not None
+    context = PartContext(engine, "SERVE_REPLICA::app#Policy#a1", "here", metadata)
+    part = Recording(RecordConfig(folder=str(folder), **settings), context)
+    part.open()
+    engine.observers.add(part.observer())
     try:
-        yield Recorded(engine, observers.recorder)
+        yield Recorded(engine, part.recorder)
     finally:
         engine.close()
-        observers.close()
+        engine.observers.remove(part.recorder)
+        part.recorder.close()
+        part.close()

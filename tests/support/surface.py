@@ -44,6 +44,7 @@ def surface() -> str:
         "Deployment file: args": models_of("vlagents_ray.serve.config.deployment:ServerArgs"),
         "Deployment file: args.config of each policy": settings_of("policies"),
         "Deployment file: args.dialects": settings_of("dialects"),
+        "Deployment file: args.parts": settings_of("replica"),
         "Evaluation file": models_of("vlagents_ray.evaluate.plan.config:EvalConfig"),
         "Evaluation file: env_options of each environment": settings_of("envs"),
         "HTTP: paths of an application": paths(),
@@ -115,7 +116,8 @@ def error_codes() -> Iterator[str]:
 
 def registered() -> Iterator[str]:
     registry = importlib.import_module("vlagents_ray.registry")
-    for kind in ("policies", "wrappers", "envs", "dialects", "robots", "leaders", "exports", "trackers"):
+    kinds = ("policies", "wrappers", "envs", "dialects", "robots", "leaders", "replica", "pages", "exports", "trackers")
+    for kind in kinds:
         yield f"{kind}: {', '.join(sorted(registry.names(kind)))}"
 
 
@@ -161,7 +163,7 @@ def _models(annotation: Any) -> Iterator[Any]:
 
 def paths() -> Iterator[str]:
     http = importlib.import_module("vlagents_ray.serve.endpoints.http")
-    live = importlib.import_module("vlagents_ray.serve.observers.live_page")
+    live = importlib.import_module("vlagents_ray_live.live_page")
     weights = importlib.import_module("vlagents_ray.serve.endpoints.weights")
     watched = live.live_routes(None, open_to_network=False)
     pushed = weights.weights_routes(None, 0.0, open_to_network=False)
@@ -173,9 +175,10 @@ def paths() -> Iterator[str]:
 
 def series() -> list[str]:
     """By the calls that make them, since Ray's own series cannot be listed."""
-    tree = ast.parse((ROOT / "vlagents_ray/serve/replica/metrics.py").read_text())
+    files = (*ROOT.glob("vlagents_ray/serve/**/*.py"), *ROOT.glob("plugins/*/vlagents_ray_*/**/*.py"))
+    texts = [text for text in (file.read_text() for file in files) if "make = partial(series, " in text]
     found = []
-    for call in ast.walk(tree):
+    for call in (node for text in texts for node in ast.walk(ast.parse(text))):
         if isinstance(call, ast.Call) and getattr(call.func, "id", "") == "make":
             kind, name, _, *tags = call.args
             words = [ast.literal_eval(tag) for tag in tags]

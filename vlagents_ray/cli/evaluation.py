@@ -8,7 +8,7 @@ import threading
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 from urllib.parse import urlsplit
 
 import typer
@@ -33,6 +33,7 @@ from vlagents_ray.evaluate import (
 )
 from vlagents_ray.evaluate.checkpoint_watcher import CheckpointWatcher, rounds
 from vlagents_ray.evaluate.plan.cases import EvalCase, cells
+from vlagents_ray.evaluate.report.evaluation_page import EvaluationPage
 from vlagents_ray.evaluate.report.results_document import ProgressDocument, ResultsDocument
 from vlagents_ray.evaluate.report.terminal import LineProgress
 from vlagents_ray.evaluate.results.database import FILE
@@ -40,24 +41,24 @@ from vlagents_ray.evaluate.results.summary import errors_of_policies, failing_ce
 from vlagents_ray.policies.base.checkpoint import STEP
 from vlagents_ray.ray_tools.private import node_of_this_process
 from vlagents_ray.registry import registered_class
-from vlagents_ray.serve.access.api_keys import load_keys
+from vlagents_ray.serve.access.api_keys import load_keys, require_watch_keys
 from vlagents_ray.serve.launch.deployment_file import own_settings
 from vlagents_ray.serve.models.checkpoints import CHOICE
 from vlagents_ray.serve.ports import LOOPBACK, is_free
 
-if TYPE_CHECKING:
-    from vlagents_ray.serve.scaling.sibling_replicas import ReplicasInCluster
-
 POLICY_ERRORS = 3  # exit status: an error of the policy ended every episode of a cell
 LOOK_S = 1.0  # period at which the folder is read
 _PORT = 8050  # of the page, if it is free
-_NAME = "eval"  # the page's application, for keys that are limited to applications
+_PAGE = "live"  # name of the page in the registry
 
 
 def live_address(at: str | None) -> tuple[str, int]:
-    """Return the (host, port) that `--live-at` states; None is `--live` alone."""
-    from vlagents_ray.serve.observers.live_page import require_watch_keys
+    """Return the (host, port) that `--live-at` states; None is `--live` alone.
 
+    Raises:
+        ConfigError: The plug-in with the page is not installed, or other machines would reach it without a key.
+    """
+    registered_class("pages", _PAGE)
     if at is None:
         return LOOPBACK, _PORT if is_free(LOOPBACK, _PORT) else 0
     try:
@@ -81,13 +82,10 @@ def shown_progress(config: EvalConfig, live: tuple[str, int] | None, *, goes_on:
     if live is None:
         yield progress
         return
-    from vlagents_ray.serve.scaling.sibling_replicas import ReplicasInCluster
-
     document = ProgressDocument(config.out, progress, goes_on=goes_on)
     urls = [str(one.url) for one in config.policies]
     apps = [url.removeprefix("serve://") for url in urls if url.startswith("serve://")]
-    others = ReplicasInCluster(apps) if apps and node_of_this_process() is not None else None
-    with _page(document, others, live):
+    with _page(document, apps if node_of_this_process() is not None else [], live):
         try:
             yield document
         except Exception as error:
@@ -100,17 +98,14 @@ def shown_progress(config: EvalConfig, live: tuple[str, int] | None, *, goes_on:
 
 def follow(results: Path, address: tuple[str, int]) -> None:
     """Serve the page of an evaluation or a training that another process writes to a folder, until Ctrl-C."""
-    with _page(ResultsDocument(results), None, address), contextlib.suppress(KeyboardInterrupt):
+    with _page(ResultsDocument(results), [], address), contextlib.suppress(KeyboardInterrupt):
         threading.Event().wait()
 
 
 @contextlib.contextmanager
-def _page(document: ResultsDocument, others: ReplicasInCluster | None, address: tuple[str, int]) -> Iterator[None]:
-    from vlagents_ray.serve.observers.live_page import page_server
-    from vlagents_ray.serve.observers.live_view import Fleet
-
-    fleet = Fleet(None, others, document.read)
-    with page_server(fleet, address, load_keys(), name=_NAME, videos=document.video) as url:
+def _page(document: ResultsDocument, apps: Sequence[str], address: tuple[str, int]) -> Iterator[None]:
+    page: EvaluationPage = registered_class("pages", _PAGE)()
+    with page.serve(document, apps, address, load_keys()) as url:
         out.print(f"live: {url}")
         yield
 

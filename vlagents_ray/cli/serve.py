@@ -112,6 +112,7 @@ def connection_lines(
     config: Deployment, urls: Mapping[str, str], host: str, keys: Path | None = None, *, insecure: bool = False
 ) -> Iterator[str]:
     """Return lines with the URL, policy and page of each application, and addresses for clients of other systems."""
+    from vlagents_ray.registry import registered_class
     from vlagents_ray.serve.config.deployment import ServerArgs
     from vlagents_ray.serve.launch.deployment_file import IMPORT_PATH, own_settings
 
@@ -133,7 +134,9 @@ def connection_lines(
         curl = f'curl {ca}-H "Authorization: Bearer $VLAGENTS_RAY_API_KEY" ' if keyed else ""
         yield f"  API: {curl}{url}/docs"
         if not (insecure or args.access.insecure):  # --insecure shows no live page
-            yield f"  live page: {url}/live"
+            for part in args.parts.on():
+                for title, path in registered_class("replica", part).pages.items():
+                    yield f"  {title}: {url}{path}"
         for name, one in args.dialects.describe().items():
             places = [one["address"]] if "address" in one else []
             for path in () if places else one["paths"]:  # such as "WS /openpi"

@@ -28,10 +28,10 @@ from vlagents_ray.policies.random import Random
 from vlagents_ray.robot.record import Recorder
 from vlagents_ray.serve.engine.engine import Engine
 from vlagents_ray.serve.local_agent import LocalAgent
-from vlagents_ray.serve.observers import episodes
 from vlagents_ray_learn.open_loop.command import parse_episodes
 from vlagents_ray_learn.open_loop.comparison import OpenLoopPlan, OpenSession, candidate, compare, open_datasets
 from vlagents_ray_learn.open_loop.recorded_dataset import Names, RecordedDataset
+from vlagents_ray_live import episodes
 
 
 class Follow(Agent):

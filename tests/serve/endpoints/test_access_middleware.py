@@ -17,6 +17,8 @@ import numpy as np
 import pytest
 from asgi_server import served
 from eval_fakes import wait_for
+from starlette.responses import PlainTextResponse
+from starlette.testclient import TestClient
 from starlette.types import Message, Receive, Scope, Send
 from websockets.exceptions import ConnectionClosed, InvalidStatus
 from websockets.sync.client import connect
@@ -108,6 +110,33 @@ def test_no_path_answers_without_a_key(endpoint: Endpoint, path: str) -> None:
         assert document["request_id"]
     status, said, body = endpoint.get(path, bearer(endpoint.tokens["other"]))
     assert (status, json.loads(body)["code"]) == (403, "forbidden")
+
+
+@pytest.mark.parametrize(
+    ("method", "path", "is_served"),
+    [
+        ("GET", "/page", True),
+        ("HEAD", "/page", True),
+        ("POST", "/page", False),
+        ("GET", "/page/", False),
+        ("GET", "/page/data", False),
+        ("GET", "//page", False),
+        ("GET", "/pag", False),
+        ("GET", "/healthz", True),
+    ],
+)
+def test_only_the_page_itself_is_read_without_a_key(
+    endpoint: Endpoint, method: str, path: str, is_served: bool
+) -> None:
+    reached: list[str] = []
+
+    async def inside(scope: Scope, receive: Receive, send: Send) -> None:
+        reached.append(scope["path"])
+        await PlainTextResponse("a page without data")(scope, receive, send)
+
+    guard = AccessMiddleware(inside, Keys.from_file(endpoint.file), "noop", public=["/page"])
+    answer = TestClient(guard).request(method, path)
+    assert (answer.status_code, reached) == ((200, [path]) if is_served else (401, []))
 
 
 def test_without_keys_pages_of_other_sites_are_refused(endpoint: Endpoint) -> None:

@@ -23,7 +23,7 @@ def test_the_series_of_a_gpu_have_values_only_with_one(monkeypatch: pytest.Monke
 
         return SimpleNamespace(set=write, inc=write, observe=write)
 
-    monkeypatch.setattr(metrics, "_series", series)
+    monkeypatch.setattr(metrics, "series", series)
     engine = Engine(Noop.from_config({}))
     engine.start(threaded=False)
     exporter = Exporter(engine, {})

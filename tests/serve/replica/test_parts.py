@@ -13,8 +13,10 @@ from pydantic import ValidationError
 from starlette.responses import PlainTextResponse
 from starlette.routing import Route
 
+from vlagents_ray import registry
 from vlagents_ray.errors import ConfigError, InvalidInput
 from vlagents_ray.policies.noop import Noop
+from vlagents_ray.registry import RegistryEntry
 from vlagents_ray.serve.config.deployment import ServerArgs
 from vlagents_ray.serve.config.parts import PartArgs, PartConfig
 from vlagents_ray.serve.engine.engine import Engine
@@ -97,7 +99,9 @@ class NoPart:
 
 
 @pytest.fixture
-def context() -> PartContext:
+def context(monkeypatch: pytest.MonkeyPatch) -> PartContext:
+    """What parts use of a replica, where no plug-in has parts that are on by default."""
+    monkeypatch.setattr(registry, "_entry_points", lambda _: {})
     events.clear()
     return PartContext(Engine(Noop()), "app#replica", "node", dict)
 
@@ -152,6 +156,37 @@ def test_a_class_that_is_no_part_and_an_unknown_name_are_errors() -> None:
         ServerArgs(policy="noop", parts={f"{HERE}:NoPart": {}})
     with pytest.raises(ValidationError, match="'latency' is not registered"):
         ServerArgs(policy="noop", parts={"latency": {}})
+
+
+@pytest.fixture
+def registered(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Registers a part that is on by default and one that is not, and no others."""
+    entries = {
+        "counter": RegistryEntry(f"{HERE}:Counter", by_default=True),
+        "plain": RegistryEntry(f"{HERE}:Plain"),
+    }
+    monkeypatch.setitem(registry._BUILT_IN, "replica", entries)
+    monkeypatch.setattr(registry, "_entry_points", lambda _: {})
+
+
+@pytest.mark.parametrize(
+    ("parts", "limits"),
+    [
+        ({}, {"counter": 3}),
+        ({"counter": {"limit": 5}}, {"counter": 5}),
+        ({"counter": None}, {}),
+        ({"plain": {}, "counter": None}, {"plain": None}),
+        ({"plain": {}}, {"counter": 3, "plain": None}),
+        ({"plain": None}, {"counter": 3}),
+    ],
+)
+def test_a_part_may_be_on_by_default_and_null_turns_it_off(
+    registered: None, parts: dict[str, Any], limits: dict[str, Any]
+) -> None:
+    args = ServerArgs(policy="noop", parts=parts)
+    at_the_replica = ServerArgs(**args.model_dump(mode="json"))
+    for settings in (args, at_the_replica):
+        assert {name: getattr(config, "limit", None) for name, config in settings.parts.on().items()} == limits
 
 
 @pytest.fixture

@@ -11,7 +11,7 @@ import ray
 from ray import serve
 from ray.exceptions import ActorDiedError, ActorUnavailableError, RayTaskError
 
-from vlagents_ray.errors import InvalidInput, InvalidWeights, VLAgentsError
+from vlagents_ray.errors import InvalidWeights
 from vlagents_ray.serve.scaling import sibling_replicas
 from vlagents_ray.serve.scaling.rebalancer import ReplicaLoad
 from vlagents_ray.serve.scaling.session_migration import PeerEnded, PeerUnreachable
@@ -152,30 +152,3 @@ def test_a_client_goes_where_it_was_announced_or_stays(
     cluster = Cluster(monkeypatch, a=({"policy": "noop"}, "actor"), late=None, dead=ActorDiedError())
     assert asyncio.run(SiblingReplicas().announce_client(cluster.name(replica))) == answer
     assert cluster.asked == ([] if replica == "gone" else [(replica, "expect_client")])
-
-
-def test_a_command_reaches_the_replica_that_has_the_session(monkeypatch: pytest.MonkeyPatch) -> None:
-    refused = raised(InvalidInput("no such command")).as_instanceof_cause()
-    for answers, pressed in (
-        ({"dead": ActorDiedError(), "has": {"do": "stop"}}, {"do": "stop"}),
-        ({"dead": ActorDiedError()}, None),
-        ({"refuses": refused}, InvalidInput),
-    ):
-        Cluster(monkeypatch, **answers)  # type: ignore[arg-type]
-        pressing = ReplicasInCluster(["app"]).press("arm", "stop", "lab")
-        if isinstance(pressed, type):
-            with pytest.raises(VLAgentsError, match="no such command"):
-                asyncio.run(pressing)
-        else:
-            assert asyncio.run(pressing) == pressed
-
-
-def test_views_are_read_by_name(monkeypatch: pytest.MonkeyPatch) -> None:
-    cluster = Cluster(monkeypatch, a="a snapshot", b="another")
-
-    async def read() -> list[Any]:
-        views = await ReplicasInCluster(["app"], but=cluster.name("b")).views()
-        return [(name, await view(7, ["arm"])) for name, view in views.items()]
-
-    assert asyncio.run(read()) == [(cluster.name("a"), "a snapshot")]
-    assert cluster.asked == [("a", "ReplicaView.read")]

@@ -364,6 +364,16 @@ def require_access(host: str, keys: Keys | None, insecure: bool) -> None:
         )
 
 
+def require_watch_keys(host: str, keys: Keys | None) -> None:
+    """Raise `ConfigError` if other machines would reach a page on `host` without a key."""
+    if keys is None and not is_loopback(host):
+        raise ConfigError(
+            f"live page on {host}: without keys all cameras would be public. Make a key (`vlagents-ray keys new NAME "
+            f"--scope watch --file keys.json`) and set VLAGENTS_RAY_KEYS_FILE=keys.json; or stay on loopback, and look "
+            f"at it through `ssh -L`"
+        )
+
+
 def warn_of_plain_http(host: str) -> None:
     """Log a warning if API keys would cross a network unencrypted."""
     if not is_loopback(host):

@@ -34,24 +34,6 @@ class _DeploymentModel(BaseModel):
     model_config = ConfigDict(extra="forbid", hide_input_in_errors=True)  # errors are logged; inputs may be secret
 
 
-class LiveArgs(_DeploymentModel):
-    """The last seconds of each session, which a button of the live page saves; see `vlagents_ray.serve.observers`."""
-
-    folder: AbsolutePath = Field(
-        description="folder of the datasets, on each replica's own node or shared; each replica writes its own below it"
-    )
-    ring_s: float = Field(default=30.0, gt=0, le=600, description="how much of each session is held, s")
-    memory_mb: float = Field(
-        default=256.0,
-        gt=0,
-        le=1_000_000,
-        description="memory that all sessions of a replica take at most, MB; the oldest goes first",
-    )
-    most_gb: float = Field(
-        default=50.0, gt=0, le=1_000_000, description="size of the folder at which nothing more is saved, GB"
-    )
-
-
 class EnvironmentArgs(_DeploymentModel):
     """The Python environment of a policy; by default the policy runs in the replica, in the cluster's environment."""
 
@@ -165,26 +147,6 @@ class StreamArgs(_DeploymentModel):
         if self.ports is not None and self.ports[0] > self.ports[1]:
             raise ValueError(f"ports: got {list(self.ports)}, want the first and the last one, such as [9000, 9015]")
         return self
-
-
-class RecordArgs(_DeploymentModel):
-    """The recording of sessions as LeRobotDatasets, see `vlagents_ray.serve.observers.recording`."""
-
-    folder: AbsolutePath = Field(
-        description="folder of the datasets, on each replica's own node or shared; each replica writes its own below it"
-    )
-    share: float = Field(default=1.0, gt=0, le=1, description="share of the episodes, drawn at each reset")
-    pictures: Literal["exact", "small"] = Field(
-        default="exact",
-        description="exact: each pixel as the policy got it, in lossless H.264; small: as videos for training, some "
-        "twenty times smaller, on which the same policy acts a little differently",
-    )
-    fps: float = Field(
-        default=10.0, gt=0, le=10_000, description="rate of the frames, one for each act, that the videos assume"
-    )
-    most_gb: float = Field(
-        default=50.0, gt=0, le=1_000_000, description="size of the folder at which the recording ends, GB"
-    )
 
 
 class LimitArgs(_DeploymentModel):
@@ -361,14 +323,13 @@ class ServerArgs(_DeploymentModel):
     limits: LimitArgs = LimitArgs()
     access: AccessArgs = AccessArgs()
     stream: StreamArgs = StreamArgs()
-    live: LiveArgs | None = Field(
-        default=None, description="keeps the last seconds of each session, for the live page; unset: nothing is kept"
-    )
     resources: ResourceArgs = ResourceArgs()
-    record: RecordArgs | None = Field(default=None, description="keeps requests and answers; unset: nothing is kept")
     environment: EnvironmentArgs = Field(default=EnvironmentArgs(), description="the Python that the policy runs in")
     dialects: DialectArgs = Field(default=DialectArgs(), description="other systems' clients that may connect")
-    parts: PartArgs = Field(default=PartArgs(), description="parts of the replica that plug-ins add")
+    parts: PartArgs = Field(
+        default=PartArgs(),
+        description="parts of the replica that plug-ins add; null turns one off that is on by default",
+    )
 
     @property
     def initial_replicas(self) -> int:

@@ -84,10 +84,6 @@ class DialectArgs(RegisteredArgs):
                 raise ValueError(f"{shared} share port {port}; each needs one of its own")
         return self
 
-    def on(self) -> dict[str, DialectConfig]:
-        """Return the settings of the enabled dialects, by name, in the order of the registry."""
-        return dict(self.model_extra or {})
-
     def gateways(self) -> dict[str, PortConfig]:
         """Return the settings of the dialects that have their own port, by name."""
         return {name: one for name, one in self.on().items() if isinstance(one, PortConfig)}

@@ -6,6 +6,7 @@ from typing import Any, ClassVar
 
 from pydantic import BaseModel
 
+from vlagents_ray.registry import entries, names
 from vlagents_ray.serve.config.registered import RegisteredArgs
 
 
@@ -14,12 +15,20 @@ class PartConfig(BaseModel, extra="forbid"):
 
 
 class PartArgs(RegisteredArgs):
-    """The settings of all parts that are on, by name."""
+    """The settings of parts, by name; null turns a part off that is on by default."""
 
     kind: ClassVar[str] = "replica"
     base: ClassVar[str] = "vlagents_ray.serve.replica.part.ReplicaPart"
     config_base: ClassVar[type[BaseModel]] = PartConfig
 
     def on(self) -> dict[str, Any]:
-        """Return the settings of the enabled parts, by name, in the order of the registry."""
-        return dict(self.model_extra or {})
+        """Return the settings of the enabled parts, by name, in the order of the registry.
+
+        A part that is on by default is on where its plug-in is installed: a policy's own Python may lack it.
+        """
+        settings = dict(self.model_extra or {})
+        for name, entry in entries(self.kind).items():
+            if entry.by_default and name not in settings:
+                settings[name] = self.config_of(name)()
+        in_order = dict.fromkeys((*names(self.kind), *settings))
+        return {name: settings[name] for name in in_order if settings.get(name) is not None}

@@ -13,7 +13,10 @@ from vlagents_ray.registry import names, registered_class
 
 
 class RegisteredArgs(BaseModel, extra="allow"):
-    """A section of a deployment file with a key for each class that is on: a registered name, or "module:Class"."""
+    """A section of a deployment file with a key for each class that is on: a registered name, or "module:Class".
+
+    A class whose value is null is off.
+    """
 
     kind: ClassVar[str]  # of names, as in `registry.names`
     base: ClassVar[str]  # "module.Class" that the classes derive from, for messages
@@ -29,7 +32,7 @@ class RegisteredArgs(BaseModel, extra="allow"):
         read = create_model("_Registered", **fields).model_validate(data)
         settings = {name: getattr(read, name) for name in fields}
         in_order = dict.fromkeys((*names(cls.kind), *settings))
-        return {name: settings[name] for name in in_order if settings.get(name) is not None}
+        return {name: settings[name] for name in in_order if name in settings}
 
     @classmethod
     def config_of(cls, name: str) -> type[BaseModel]:
@@ -42,6 +45,10 @@ class RegisteredArgs(BaseModel, extra="allow"):
                 f"Config is a {cls.config_base.__name__}"
             )
         return config
+
+    def on(self) -> dict[str, Any]:
+        """Return the settings of the classes that are on, by name, in the order of the registry."""
+        return {name: config for name, config in (self.model_extra or {}).items() if config is not None}
 
     @classmethod
     def registered_fields(cls) -> dict[str, FieldInfo]:

@@ -1,8 +1,8 @@
 """Access control of a replica's HTTP paths and WebSockets: API keys, time limits for slow clients, and their end.
 
 The middleware wraps an ASGI application, so that all of its paths, including the dialects, are protected in the same
-way. Two paths require no key: `/healthz` reports only whether the policy is ready, or the step of loading that it has
-reached, and `/live` is a page without data. A WebSocket is refused before it is accepted.
+way. Some paths require no key: `/healthz` reports only whether the policy is ready, or the step of loading that it has
+reached, and `public` ones are pages without data. A WebSocket is refused before it is accepted.
 
 When the client of a WebSocket leaves, the task that serves it is cancelled, as Serve cancels requests over HTTP. None
 of the client's waiting requests is executed then. When the replica stops (`Shutdown`), the messages that have arrived
@@ -32,7 +32,7 @@ from vlagents_ray.serve.engine.pauses import note_connection
 
 logger = logging.getLogger(__name__)
 
-LIVE_PAGE = "/live"  # see `vlagents_ray.serve.observers.live_page`
+_HEALTH = "/healthz"
 
 _TICK_S = 0.5  # period at which a WebSocket's key and time limits are checked
 _DROPPED_BYTES = 2**20  # a connection is closed after a refused request with a longer body
@@ -76,6 +76,7 @@ class AccessMiddleware:
         hosts: Collection[str] = (),
         admission: Admission | None = None,
         shutdown: Shutdown | None = None,
+        public: Collection[str] = (),
     ) -> None:
         """Protect `app`.
 
@@ -86,10 +87,12 @@ class AccessMiddleware:
             hosts: Further host names of the server, see `require_own_page`.
             admission: The memory in flight of the replica, which also counts incomplete messages of WebSockets.
             shutdown: The end of the replica; by default it has none.
+            public: The paths of pages without data, which need no key.
         """
         self._admission, self._shutdown = admission, shutdown or Shutdown()
         self._app, self._keys, self._name = app, keys, name
         self._hosts, self._slow_s, self._idle_s = hosts, slow_s, idle_s
+        self._public = frozenset({_HEALTH, *public})
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Serve one connection as specified by ASGI."""
@@ -101,7 +104,7 @@ class AccessMiddleware:
             note_connection(scope)
         caller: Identity = NoKey.OPEN
         try:
-            if _is_public(scope):
+            if _is_page(scope, self._public):
                 pass
             elif self._keys is None:
                 require_own_page(headers, self._hosts)  # a page that the robot's user opens can reach loopback
@@ -138,10 +141,11 @@ class AccessMiddleware:
         await socket.run(self._app, scope)
 
 
-def _is_public(scope: Scope) -> bool:
+def _is_page(scope: Scope, public: Collection[str]) -> bool:
+    """Return whether a request reads one of the `public` paths."""
     path: str = scope["path"]
     path = path.removeprefix(scope.get("root_path", ""))
-    return scope["type"] == "http" and scope["method"] in ("GET", "HEAD") and path in ("/healthz", LIVE_PAGE)
+    return scope["type"] == "http" and scope["method"] in ("GET", "HEAD") and path in public
 
 
 def _has_body(scope: Scope, most: int = 0) -> bool:

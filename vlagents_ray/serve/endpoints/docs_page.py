@@ -42,9 +42,6 @@ _PATHS = f"""\
 `WS /v1/weights`, `GET /v1/weights`
     New weights from a learner, with a key of the scope `weights`; see `vlagents_ray_learn.Publisher`. The versions
     that act.
-`GET /live`
-    A page that shows what the sessions do now. With keys, it asks for one with the scope `watch`, and has buttons for
-    one that also has the scope `operate`. Robots that offer it are moved there.
 `GET /v1/metadata`
     Policy, checkpoint, contract, protocol version, every way in.
 `GET /healthz`
@@ -81,11 +78,16 @@ _TIMING = """\
 
 
 def docs_page(metadata: dict[str, Any]) -> str:
-    """Return the page as HTML, from the document of `GET /v1/metadata`; each dialect provides its own entry in it."""
+    """Return the page as HTML, from the document of `GET /v1/metadata`, in which dialects and parts have entries."""
     policy = html.escape(str(metadata["policy"]))
     dialects = "".join(
         f"`{', '.join(one.get('paths') or [one['address']])}`\n    Clients of {one['clients']}. {one['summary']}\n"
         for one in (metadata.get("dialects") or {}).values()
+    )
+    pages = "".join(
+        f"`GET {part['page']}`\n    {part['summary']}\n"
+        for part in (metadata.get("parts") or {}).values()
+        if part.keys() >= {"page", "summary"}
     )
     errors = "".join(
         f"{cls.status} `{code}`\n    {(cls.__doc__ or '').strip().partition(chr(10))[0]}\n"
@@ -101,7 +103,7 @@ Choose a session id for each robot or environment and send it as <code>{SESSION_
 <p>Where the server has API keys, send yours with every request: <code>Authorization: Bearer KEY</code>.</p>
 <h2>With curl</h2><pre>{html.escape(_CURL)}</pre>
 <h2>With Python</h2><pre>{html.escape(_PYTHON)}</pre>
-<h2>Paths</h2>{_entries(_PATHS)}
+<h2>Paths</h2>{_entries(_PATHS + pages)}
 <p>A replica that stops hands its sessions over: the next request of the same session id goes on where it was.</p>
 <h2>Headers</h2>{_entries(_HEADERS)}
 {"<h2>Clients of other systems, as they are</h2>" + _entries(dialects) if dialects else ""}

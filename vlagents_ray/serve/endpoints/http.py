@@ -3,7 +3,6 @@
     POST /v1/reset, /v1/act, /v1/close   multipart/form-data, application/json, or one binary frame
     WS   /v1/stream                      sessions that end with the connection; binary frames or probes
     WS   /v1/weights                     new weights from a learner, see `vlagents_ray.serve.endpoints.weights`
-    GET  /live, /v1/live, WS /v1/live    the state of the sessions, see `vlagents_ray.serve.observers.live_page`
     GET  /healthz, /v1/metadata, /docs
 
 Errors over HTTP are problem+json with a stable code; over WebSocket they are reply frames.
@@ -60,7 +59,7 @@ def build_http_app(
         metadata: Returns the document of `GET /v1/metadata`.
         machine_metadata: Returns the metadata for a caller on the machine with the given boot id.
         more: The routes of other systems' clients, learners and viewers, see `vlagents_ray.serve.dialects`,
-            `vlagents_ray.serve.endpoints.weights` and `vlagents_ray.serve.observers.live_page`.
+            `vlagents_ray.serve.endpoints.weights` and `vlagents_ray.serve.replica.part`.
     """
     server = _HttpEndpoint(engine, metadata, limits, machine_metadata)
     app = Starlette(

@@ -2,7 +2,7 @@
 
 An observer is called on the threads that process requests and answers: it copies data or keeps references, and leaves
 the rest to its own thread. Its memory is bounded: beyond a limit in bytes or entries it drops data. Requests that could
-not be decoded reach no observer. The observers are in `vlagents_ray.serve.observers`.
+not be decoded reach no observer. Parts of a replica add observers.
 """
 
 from __future__ import annotations

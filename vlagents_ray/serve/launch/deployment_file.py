@@ -255,8 +255,8 @@ def _checked(document: object, source: str, step_follows: bool = False) -> Deplo
             # Relative paths refer to this process's folder, so Ray gets absolute ones.
             if "environment" in app.args:
                 app.args["environment"] = args.environment.model_dump(exclude_unset=True)
-            if args.record is not None:
-                app.args["record"] = args.record.model_dump(exclude_unset=True)
+            if "parts" in app.args:
+                app.args["parts"] = args.parts.model_dump(exclude_unset=True)
             _require_policy(args, own_settings(app), installed=not app.runtime_env, step_follows=step_follows)
     except ValidationError as error:
         model = ServerArgs if error.title == ServerArgs.__name__ else Deployment

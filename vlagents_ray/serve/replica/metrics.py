@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import logging
 import time
-from collections import Counter as Counts
 from collections.abc import Iterable, Iterator, Mapping
 from functools import partial
 from typing import Any, TypeVar
@@ -22,7 +21,6 @@ from vlagents_ray.policies.compilation import CudaGraph
 from vlagents_ray.serve.access.api_keys import Keys
 from vlagents_ray.serve.engine.engine import Engine
 from vlagents_ray.serve.engine.metrics_buffer import STAGES, Collected
-from vlagents_ray.serve.observers.recording import SessionRecorder
 from vlagents_ray.serve.periodic import Periodic
 from vlagents_ray.serve.queue.batch_queue import LoadMeter
 
@@ -41,14 +39,12 @@ T = TypeVar("T")
 class Exporter:
     """Exports an engine's stats to Ray once a second, on a separate thread, until `close`."""
 
-    def __init__(
-        self, engine: Engine, tags: dict[str, str], keys: Keys | None = None, recorder: SessionRecorder | None = None
-    ) -> None:
+    def __init__(self, engine: Engine, tags: Mapping[str, str], keys: Keys | None = None) -> None:
         """Create the series of an engine with the `tags` application, deployment, replica and policy.
 
-        The state of the file of the `keys` and the counts of the `recorder` are exported, if there are any.
+        The state of the file of the `keys` is exported, if there are any.
         """
-        make = partial(_series, tags)
+        make = partial(series, tags)
         self._engine = engine
         self._requests = make(Counter, "requests", "Requests answered.", "op", "transport", "class", "code")
         self._latency = make(
@@ -71,12 +67,8 @@ class Exporter:
         self._out_of_memory = make(Counter, "out_of_memory", "Forward passes that did not fit into memory.")
         self._uncompiled = make(Gauge, "uncompiled", "Batch sizes that run without the compilation that is set.")
         self._unreadable = make(Gauge, "keys_unreadable_s", "Time in which the key file could not be read.")
-        self._recorded = make(Counter, "recorded_frames", "Acts of recorded sessions.", "outcome")
-        # 1 while sessions are recorded, 0 once that has ended or if `record` is not set.
-        self._recording = make(Gauge, "recording", "Whether sessions are recorded.")
-        self._keys, self._recorder = keys, recorder
+        self._keys = keys
         self._replayed = 0  # exported part of the replays
-        self._frames = Counts[str]()  # exported part of the recorder's counts
         self._meter = LoadMeter(engine.queue)
         self._periodic = Periodic(PERIOD_S)
 
@@ -112,13 +104,6 @@ class Exporter:
             self._replays.inc(new)
             self._replayed += new
         self._unreadable.set(0.0 if self._keys is None else self._keys.unreadable_s)
-        recorder = self._recorder
-        self._recording.set(float(recorder is not None and recorder.ended is None))
-        frames = {} if recorder is None else {"saved": recorder.saved, "lost": recorder.lost}
-        for outcome, total in frames.items():
-            if new := total - self._frames[outcome]:
-                self._recorded.inc(new, {"outcome": outcome})
-                self._frames[outcome] = total
 
     def _export_collected(self, collected: Collected) -> None:
         for (op, transport, kind, code), sample in collected.requests.items():
@@ -143,9 +128,19 @@ class Exporter:
             self._padding.inc(collected.padding)
 
 
-def _series(tags: Mapping[str, str], kind: Any, name: str, text: str, *own: str, **options: Any) -> Any:
-    """Create a series of `kind`, with `tags` and its `own` tags, which each value sets."""
-    return kind(f"vlagents_{name}", description=text, tag_keys=(*tags, *own), **options).set_default_tags(tags)
+def series(tags: Mapping[str, str], kind: Any, name: str, text: str, *own: str, **options: Any) -> Any:
+    """Create a series of a replica, with the prefix `vlagents_`.
+
+    Args:
+        tags: The tags of the replica, such as `PartContext.metric_tags`.
+        kind: The class in `ray.util.metrics`.
+        name: Its name without the prefix.
+        text: Its description.
+        own: The names of its own tags, which each value sets.
+        options: Further arguments of `kind`, such as the `boundaries` of a histogram.
+    """
+    created = kind(f"vlagents_{name}", description=text, tag_keys=(*tags, *own), **options)
+    return created.set_default_tags(dict(tags))
 
 
 def _in_slices(values: Iterable[T]) -> Iterator[T]:

@@ -6,7 +6,10 @@ A plug-in registers a class by the entry-point group `vlagents_ray.replica`, and
       policy: pi0
       parts: {latency_log: {folder: runs/latency}}
 
-Routes are behind the server's access control: with API keys on, a caller without a key reaches none of them.
+A part whose registry entry says `by_default` is on where its plug-in is installed; `parts: {NAME: null}` turns it off.
+
+Routes are behind the server's access control: with API keys on, a caller without a key reaches none of them but
+`pages`, which hold no data.
 
 A deployment may have several replicas, each with a part of its own. A part calls the same part of the others by the
 methods that it lists in `sibling_methods`:
@@ -30,7 +33,7 @@ import inspect
 import logging
 from collections.abc import Awaitable, Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any, ClassVar, Protocol
 
 from starlette.routing import BaseRoute
@@ -66,7 +69,14 @@ class PartContext:
     node: str  # name of its node
     metadata: Callable[[], Mapping[str, Any]]  # the document of `GET /v1/metadata`
     part: str = ""  # name of the part, its key in the deployment file
+    metric_tags: Mapping[str, str] = field(default_factory=dict)  # of its series, see `replica.metrics.series`
     siblings: Callable[[], Awaitable[Sequence[OtherReplica]]] = no_siblings  # the application's other replicas
+    open_to_network: bool = False  # whether clients on other machines need no key, `access: {insecure: true}`
+
+    @property
+    def short_name(self) -> str:
+        """The name of the replica without those of its application and deployment, for viewers."""
+        return self.replica.rpartition("#")[2]
 
 
 class SiblingPart:
@@ -106,6 +116,10 @@ class ReplicaPart:
     sibling_methods: ClassVar[Mapping[str, float | None]] = {}
     """The methods that the same part of other replicas may call, and the time limit of each for an answer, s; None is
     no limit. A coroutine function runs on the replica's event loop, any other one in a thread."""
+
+    pages: ClassVar[Mapping[str, str]] = {}
+    """Paths of pages for a browser, by title, such as {"live page": "/live"}; `vlagents-ray serve` prints their
+    addresses. They need no key, which a browser cannot send with them: a page itself must hold no data."""
 
     def __init__(self, settings: Any, context: PartContext) -> None:
         """Create a part with the `settings` of the deployment file, an instance of its `Config`."""
@@ -148,14 +162,24 @@ class ReplicaParts:
         for part in self._parts.values():
             yield from part.routes()
 
+    def pages(self) -> frozenset[str]:
+        """Return the paths of the pages of all parts."""
+        return frozenset(path for part in self._parts.values() for path in part.pages.values())
+
     def describe(self) -> dict[str, Any]:
-        """Return the facts of all parts, by name; a part that raises an error is left out, and its error is logged."""
+        """Return the facts of the parts that have some, by name.
+
+        A part that raises an error is left out, and its error is logged.
+        """
         facts = {}
         for name, part in self._parts.items():
             try:
-                facts[name] = dict(part.describe())
+                described = dict(part.describe())
             except Exception:
                 logger.exception("part %r: its facts are not in the metadata", name)
+                continue
+            if described:
+                facts[name] = described
         return facts
 
     async def call(self, part: str, method: str, *args: Any) -> Any:

@@ -37,9 +37,6 @@ from vlagents_ray.serve.endpoints.weights import weights_routes
 from vlagents_ray.serve.engine.engine import Engine
 from vlagents_ray.serve.engine.sender import Sender
 from vlagents_ray.serve.local_agent import build_engine, policy_metadata
-from vlagents_ray.serve.observers.live_page import live_routes
-from vlagents_ray.serve.observers.live_view import Fleet
-from vlagents_ray.serve.observers.opening import open_observers
 from vlagents_ray.serve.ports import EVERYWHERE, HOST, LOOPBACK
 from vlagents_ray.serve.queue.batch_queue import LoadMeter
 from vlagents_ray.serve.replica.metrics import Exporter, tags_of
@@ -104,14 +101,21 @@ class PolicyReplica(ClientApi, SiblingApi):
         self._weights = ThisReplica(self._peers.own_name, self._engine.weights)
         self._pusher = WeightPusher(self._weights, self._peers.others)
 
-        # The observers.
+        # The parts that plug-ins add, and the metrics.
         node = ray.get_runtime_context().get_node_id()[:8]
-        self._observers = open_observers(self._engine, settings, self._peers.own_name, node, self.metadata)
-        context = PartContext(self._engine, self._peers.own_name, node, self.metadata, siblings=self._peers.others)
+        tags = tags_of(settings.policy)
+        context = PartContext(
+            self._engine,
+            self._peers.own_name,
+            node,
+            self.metadata,
+            metric_tags=tags,
+            open_to_network=settings.access.insecure,
+            siblings=self._peers.others,
+        )
         self._parts = open_parts(settings.parts, context)
-        self._fleet = Fleet(self._observers.view, self._peers)
         self._meter = LoadMeter(self._engine.queue)
-        self._metrics = Exporter(self._engine, tags_of(settings.policy), self._keys, self._observers.recorder)
+        self._metrics = Exporter(self._engine, tags, self._keys)
         self._metrics.start()
 
         # The endpoints.
@@ -158,10 +162,10 @@ class PolicyReplica(ClientApi, SiblingApi):
         self._tasks = [asyncio.ensure_future(work) for work in works]
 
     async def close(self) -> None:
-        """Close everything: first the sources of requests, then the engine, the endpoints, and last the observers.
+        """Close everything: first the sources of requests, then the engine, the endpoints, and last the parts.
 
-        In this order the engine can answer waiting requests over open endpoints, no client waits for the observers, and
-        observers receive all answers.
+        In this order the engine can answer waiting requests over open endpoints, no client waits for the parts, and
+        their observers receive all answers.
         """
         for task in self._tasks:
             task.cancel()
@@ -172,7 +176,7 @@ class PolicyReplica(ClientApi, SiblingApi):
         for endpoint in (self._local, self._plasma, self._stream):
             if endpoint is not None:
                 endpoint.close()
-        for part in (self._parts, self._observers, self._metrics):
+        for part in (self._parts, self._metrics):
             await asyncio.to_thread(part.close)
 
     async def __del__(self) -> None:
@@ -206,7 +210,6 @@ class PolicyReplica(ClientApi, SiblingApi):
         more = [
             *dialect_routes(self._args.dialects, ReplicaContext(self._engine, self.metadata, self._limits)),
             *weights_routes(self, slow_s, open_to_network=insecure),
-            *live_routes(self._fleet, open_to_network=insecure),
             *self._parts.routes(),
         ]
         inside = build_http_app(self._engine, self.metadata, self._limits, self._metadata_for_machine, more)
@@ -219,6 +222,7 @@ class PolicyReplica(ClientApi, SiblingApi):
             hosts=hosts,
             admission=self._engine.admission,
             shutdown=self._shutdown,
+            public=self._parts.pages(),
         )
 
     def metadata(self) -> dict[str, Any]:
@@ -292,9 +296,7 @@ class PolicyReplica(ClientApi, SiblingApi):
             return await call(self._migrator.held, *args)
         if part is Rebalancer:
             return call(self._rebalancer)
-        if part is WeightUpdates:
-            return await self._weights.weights(call, *args)
-        return await asyncio.to_thread(call, self._observers.view, *args)
+        return await self._weights.weights(call, *args)
 
     async def call_part(self, part: str, method: str, *args: Any) -> Any:
         """Call a method of a part for the same part of another replica, or for a process of the cluster."""

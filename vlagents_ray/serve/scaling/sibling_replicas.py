@@ -6,7 +6,6 @@ import asyncio
 import logging
 import time
 from collections.abc import Awaitable, Callable, Collection, Iterator
-from functools import partial
 from typing import Any, Concatenate, NamedTuple, ParamSpec, Protocol, TypeVar
 
 import ray
@@ -16,7 +15,6 @@ from vlagents_ray.client.transports.serve_handle import call_replica
 from vlagents_ray.errors import VLAgentsError
 from vlagents_ray.ray_tools import private
 from vlagents_ray.serve.config.deployment import POLICY
-from vlagents_ray.serve.observers.live_view import OtherReplicas, ReplicaView, SnapshotReader
 from vlagents_ray.serve.scaling.rebalancer import Rebalancer, ReplicaLoad
 from vlagents_ray.serve.scaling.session_migration import HeldSessions, Peer, PeerEnded, PeerUnreachable
 from vlagents_ray.serve.weights import WeightUpdates
@@ -31,8 +29,6 @@ _ANSWER_S = 3.0  # time limit for an answer; a replica that still loads does not
 _TRANSFER_S = 600.0  # time limit for the answer to a request that contains weights
 _QUICK_S = 0.3  # time limit for an answer while a client waits to connect
 _SILENT_S = 3.0  # time without further requests for a silent replica's load
-_VIEW_ANSWER_S = 0.3  # time limit for an answer; a late replica gets another request
-_VIEW_S = 2.0  # time for which the list of replicas is reused
 
 
 class SiblingApi(Protocol):
@@ -72,11 +68,9 @@ PEER_METHODS = {
         PeerMethod(WeightUpdates, WeightUpdates.held, _TRANSFER_S),
         PeerMethod(WeightUpdates, WeightUpdates.rest, _TRANSFER_S),
         PeerMethod(Rebalancer, Rebalancer.load, _QUICK_S),
-        PeerMethod(ReplicaView, ReplicaView.read, _VIEW_ANSWER_S),
-        PeerMethod(ReplicaView, ReplicaView.press, _ANSWER_S),
     )
 }
-"""What replicas call at each other, beside `SiblingApi`: moves of sessions, pushes of weights, loads, the live page."""
+"""What replicas call at each other, beside `SiblingApi`: moves of sessions, pushes of weights, loads."""
 
 
 class SiblingReplica(Peer):
@@ -123,14 +117,12 @@ class SiblingReplica(Peer):
     weights = call
 
 
-class ReplicasInCluster(OtherReplicas):
+class ReplicasInCluster:
     """The replicas of applications; each call looks them up again, since they may change."""
 
     def __init__(self, apps: Collection[str], but: str = "") -> None:
         """Call the replicas of `apps`, apart from the replica whose full name is `but`."""
         self._apps, self._but = apps, but
-        self._views: dict[str, SnapshotReader] = {}  # result of the last lookup
-        self._found = float("-inf")
         self._initialized: set[str] = set()
 
     async def others(self) -> list[SiblingReplica]:
@@ -138,31 +130,6 @@ class ReplicasInCluster(OtherReplicas):
         actors = dict(await asyncio.to_thread(lambda: list(self._actors())))
         self._initialized &= actors.keys()  # without those that have ended
         return [SiblingReplica(name, actor, self._initialized) for name, actor in actors.items()]
-
-    async def views(self) -> dict[str, SnapshotReader]:
-        """Return the readers of the replicas' snapshots, by name."""
-        if time.monotonic() - self._found > _VIEW_S:
-            self._found = time.monotonic()
-            self._views = {one.name: partial(one.call, ReplicaView.read) for one in await self.others()}
-        return self._views
-
-    async def press(self, session: str, do: str, by: str) -> dict[str, Any] | None:
-        """Give a command to a session, see `CommandBoard.press`; return None if no replica has the session.
-
-        Raises:
-            VLAgentsError: The replica that has the session refused the command.
-        """
-        for answer in asyncio.as_completed(
-            [one.call(ReplicaView.press, session, do, by) for one in await self.others()]
-        ):
-            try:
-                pressed: dict[str, Any] | None = await answer
-            except (PeerEnded, PeerUnreachable) as error:
-                logger.info("another replica does not answer: %s", error)
-                continue
-            if pressed is not None:
-                return pressed
-        return None
 
     def _actors(self) -> Iterator[tuple[str, Any]]:
         """Yield the name and the actor of each replica."""

@@ -29,9 +29,9 @@ from vlagents_ray.images.jpeg_png import decode
 from vlagents_ray.interface import Act, Agent
 from vlagents_ray.protocol.frames import read_error
 from vlagents_ray.serve.access import api_keys
-from vlagents_ray.serve.observers import live_page
-from vlagents_ray.serve.observers.live_page import page_server
-from vlagents_ray.serve.observers.live_view import Fleet
+from vlagents_ray_live import live_page
+from vlagents_ray_live.live_page import page_server
+from vlagents_ray_live.live_view import Fleet
 
 RNG = np.random.default_rng(0)
 IMAGE = RNG.integers(0, 255, (16, 24, 3), np.uint8)

@@ -12,6 +12,7 @@ from collections import Counter, deque
 from collections.abc import Awaitable, Callable, Collection, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any, Protocol
 
 import numpy as np
@@ -19,16 +20,15 @@ import numpy as np
 from vlagents_ray.errors import ConfigError, UnknownSession
 from vlagents_ray.policies.compilation import CudaGraph
 from vlagents_ray.protocol.json_messages import plain_values
-from vlagents_ray.serve.config.deployment import LiveArgs
 from vlagents_ray.serve.engine.engine import Engine
 from vlagents_ray.serve.engine.metrics_buffer import SAMPLE, STAGES
 from vlagents_ray.serve.models.loaded_model import LoadedModel
-from vlagents_ray.serve.observers import live
-from vlagents_ray.serve.observers.commands import TRACKED_S, CommandBoard
-from vlagents_ray.serve.observers.ring import Ring
 from vlagents_ray.serve.periodic import each_half_second
 from vlagents_ray.serve.queue.batch_queue import LoadMeter
 from vlagents_ray.serve.sessions import Session
+from vlagents_ray_live import live
+from vlagents_ray_live.commands import TRACKED_S, CommandBoard
+from vlagents_ray_live.ring import LiveConfig, Ring
 
 logger = logging.getLogger(__name__)
 
@@ -58,18 +58,21 @@ class ReplicaView:
         name: str,
         node: str,
         metadata: Callable[[], Mapping[str, Any]],
-        settings: LiveArgs | None = None,
+        settings: LiveConfig | None = None,
     ) -> None:
         """Create the view of a replica, `name` on `node`; `metadata` returns the metadata of its policy.
 
-        `settings` are for keeping the last seconds of each session, from `open` on; None keeps none.
+        With a folder in its `settings`, the last seconds of each session are kept from `open` on.
         """
+        settings = settings or LiveConfig()
         self._engine = engine
-        self._about = {"name": name, "node": node, "ring_s": None if settings is None else settings.ring_s}
+        self._about = {"name": name, "node": node, "ring_s": None if settings.folder is None else settings.ring_s}
         self._metadata = metadata
         self.commands = CommandBoard(engine.sessions, self._save)
         self.live = live.LiveObserver(engine.observers, self.commands)
-        self.ring = None if settings is None else Ring(self.live, engine.sessions, settings, name)
+        self.ring = None
+        if settings.folder is not None:
+            self.ring = Ring(self.live, engine.sessions, Path(settings.folder), settings, name)
         self._meter = LoadMeter(engine.queue)
         self._slow: dict[str, Any] = {}
         self._measured = float("-inf")
@@ -141,7 +144,9 @@ class ReplicaView:
 
     def _save(self, session: str) -> str:
         if self.ring is None:
-            raise ConfigError("save: this server keeps nothing; state `live: {folder: ...}` in its deployment file")
+            raise ConfigError(
+                "save: this server keeps nothing; set `parts: {live: {folder: ...}}` in its deployment file"
+            )
         return self.ring.save(session)
 
     def _state(self) -> dict[str, Any]:

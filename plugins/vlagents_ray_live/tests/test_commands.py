@@ -27,9 +27,9 @@ from vlagents_ray.policies.noop import Noop
 from vlagents_ray.protocol.messages import Reply, Request
 from vlagents_ray.robot.loop import LoopReport, run_loop
 from vlagents_ray.serve.access import api_keys
-from vlagents_ray.serve.observers import live_page
-from vlagents_ray.serve.observers.commands import CommandBoard
 from vlagents_ray.serve.sessions import SessionTable
+from vlagents_ray_live import live_page
+from vlagents_ray_live.commands import CommandBoard
 
 
 class Board:

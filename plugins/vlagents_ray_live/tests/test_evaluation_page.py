@@ -18,8 +18,8 @@ from recorded_results import record, runs
 from vlagents_ray.evaluate.plan.cases import cells
 from vlagents_ray.evaluate.report.results_document import ProgressDocument
 from vlagents_ray.serve.access.api_keys import Keys
-from vlagents_ray.serve.observers.live_page import page_server
-from vlagents_ray.serve.observers.live_view import Fleet
+from vlagents_ray_live.live_page import page_server
+from vlagents_ray_live.live_view import Fleet
 
 pytestmark = [pytest.mark.browser, pytest.mark.slow]
 

@@ -24,8 +24,9 @@ from vlagents_ray.errors import ConfigError
 from vlagents_ray.interface import Obs
 from vlagents_ray.protocol.messages import DEFAULT_LIMITS, Budget, Request
 from vlagents_ray.protocol.values import from_text
-from vlagents_ray.serve.observers import episodes, recording
-from vlagents_ray.serve.observers.recording import SessionRecorder, Worker
+from vlagents_ray.serve.launch.deployment_file import deployment
+from vlagents_ray_live import episodes, recording
+from vlagents_ray_live.recording import SessionRecorder, Worker
 
 
 def rows(root: Path, episode: int = 0) -> dict[str, list]:
@@ -271,8 +272,17 @@ def test_a_full_disk_ends_the_recording_and_no_session(
 
 def test_a_folder_that_cannot_be_written_to_is_told_at_the_start(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
-    with pytest.raises(ConfigError, match=r"record\.folder"), recorded(tmp_path / "file"):
+    with pytest.raises(ConfigError, match=r"parts\.record\.folder"), recorded(tmp_path / "file"):
         pass
+
+
+@pytest.mark.parametrize("part", ["record", "live"])
+def test_a_relative_folder_is_one_of_the_process_that_starts_the_server(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, part: str
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    [application] = deployment("noop", parts={part: {"folder": "kept"}}).applications
+    assert application.args["parts"] == {part: {"folder": str(tmp_path / "kept")}}
 
 
 def test_two_recorders_see_the_same(tmp_path: Path) -> None:

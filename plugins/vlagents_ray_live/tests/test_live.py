@@ -23,15 +23,14 @@ from vlagents_ray.images import jpeg_png
 from vlagents_ray.interface import Act, Obs
 from vlagents_ray.policies.noop import Noop
 from vlagents_ray.protocol.messages import DecodedFiles, Reply, Request
-from vlagents_ray.serve.config.deployment import LiveArgs
 from vlagents_ray.serve.engine.engine import Engine
 from vlagents_ray.serve.engine.observer import Observer, Observers
-from vlagents_ray.serve.observers import live, live_view, ring, spans
-from vlagents_ray.serve.observers.live import LEASE_S, RATE, LiveObserver
-from vlagents_ray.serve.observers.live_view import ReplicaView
-from vlagents_ray.serve.observers.ring import Ring
-from vlagents_ray.serve.observers.spans import RequestSpans
 from vlagents_ray.serve.requests import RANKS, PendingRequest
+from vlagents_ray_live import live, live_view, ring, spans
+from vlagents_ray_live.live import LEASE_S, RATE, LiveObserver
+from vlagents_ray_live.live_view import ReplicaView
+from vlagents_ray_live.ring import LiveConfig, Ring
+from vlagents_ray_live.spans import RequestSpans
 
 IMAGE = np.zeros((4, 4, 3), np.uint8)
 
@@ -284,12 +283,13 @@ class Saves:
     """A ring that holds frames of one session, "s"."""
 
     def __init__(self, folder: Path, frames: int, **options: Any) -> None:
-        self.settings = LiveArgs(folder=str(folder), **options)
+        self.folder = folder
+        self.settings = LiveConfig(folder=str(folder), **options)
         self.clock = clock = Clock()
         clock.now = time.monotonic()
         self.watched = LiveObserver(Observers(), clock=clock)
         sessions: Any = SimpleNamespace(ids=lambda: ["s"], all=list)
-        self.ring = Ring(self.watched, sessions, self.settings, "r")
+        self.ring = Ring(self.watched, sessions, folder, self.settings, "r")
         image = np.zeros((8, 8, 3), np.uint8)
         for _ in range(frames):
             files: DecodedFiles = {id(image): (image, memoryview(FILE))}
@@ -365,5 +365,5 @@ def test_a_save_that_fails_leaves_no_files_and_the_next_one_works(
     with pytest.raises(MessageTooLarge):
         saves.ring.save("s")
     monkeypatch.undo()
-    assert [list(folder.iterdir()) for folder in Path(saves.settings.folder).rglob("unfinished")] == [[]]
+    assert [list(folder.iterdir()) for folder in saves.folder.rglob("unfinished")] == [[]]
     saves.ring.save("s")

@@ -12,11 +12,11 @@ import pyarrow.parquet as pq
 import pytest
 from eval_fakes import wait_for
 from live_server import LiveServer, live_server
+from pydantic import ValidationError
 
 from vlagents_ray import Obs, RemoteAgent
 from vlagents_ray.interface import Act, Agent
-from vlagents_ray.serve.config.deployment import LiveArgs
-from vlagents_ray.serve.observers.ring import Ring
+from vlagents_ray_live.ring import LiveConfig, Ring
 
 IMAGE = np.random.default_rng(0).integers(0, 255, (64, 96, 3), np.uint8)
 
@@ -34,12 +34,12 @@ class Counts(Agent):
 
 
 @pytest.fixture
-def settings(tmp_path: Path) -> LiveArgs:
-    return LiveArgs(folder=str(tmp_path / "saved"))
+def settings(tmp_path: Path) -> LiveConfig:
+    return LiveConfig(folder=str(tmp_path / "saved"))
 
 
 @pytest.fixture
-def server(settings: LiveArgs) -> Iterator[LiveServer]:
+def server(settings: LiveConfig) -> Iterator[LiveServer]:
     with live_server(Counts(), settings=settings) as one:
         yield one
 
@@ -69,7 +69,7 @@ def pressed(server: LiveServer, session: str) -> dict[str, str]:
 
 
 @pytest.mark.parametrize("codec", ["jpeg", "raw"])
-def test_a_press_makes_an_episode(server: LiveServer, settings: LiveArgs, codec: str) -> None:
+def test_a_press_makes_an_episode(server: LiveServer, settings: LiveConfig, codec: str) -> None:
     with RemoteAgent(server.url, codec=codec) as agent:
         drive(agent, 8)
         [session] = server.engine.sessions.ids()
@@ -93,7 +93,7 @@ def test_a_press_makes_an_episode(server: LiveServer, settings: LiveArgs, codec:
 
 
 def test_the_oldest_goes_first_when_the_memory_is_full(tmp_path: Path) -> None:
-    with live_server(Counts(), settings=LiveArgs(folder=str(tmp_path), memory_mb=0.02)) as server:
+    with live_server(Counts(), settings=LiveConfig(folder=str(tmp_path), memory_mb=0.02)) as server:
         ring = ring_of(server)
         with RemoteAgent(server.url, codec="jpeg") as agent:
             drive(agent, 10)
@@ -106,7 +106,7 @@ def test_the_oldest_goes_first_when_the_memory_is_full(tmp_path: Path) -> None:
 
 
 def test_old_frames_are_dropped(tmp_path: Path) -> None:
-    settings = LiveArgs(folder=str(tmp_path), ring_s=0.3)
+    settings = LiveConfig(folder=str(tmp_path), ring_s=0.3)
     with live_server(Counts(), settings=settings) as server, RemoteAgent(server.url) as agent:
         drive(agent, 8)
         [session] = server.engine.sessions.ids()
@@ -119,7 +119,7 @@ def test_old_frames_are_dropped(tmp_path: Path) -> None:
 def test_where_nothing_can_be_saved_a_press_says_why(tmp_path: Path, settings: str | None, why: str) -> None:
     """Without the setting nothing is held either; a file cannot be a folder."""
     (tmp_path / "file").write_text("")
-    args = None if settings is None else LiveArgs(folder=str(tmp_path / settings))
+    args = None if settings is None else LiveConfig(folder=str(tmp_path / settings))
     with live_server(Counts(), settings=args) as server, RemoteAgent(server.url) as agent:
         drive(agent, 3)
         [session] = server.engine.sessions.ids()
@@ -127,3 +127,8 @@ def test_where_nothing_can_be_saved_a_press_says_why(tmp_path: Path, settings: s
         assert said["state"] == "refused"
         assert said["why"]
         assert why in said["why"]
+
+
+def test_settings_of_a_ring_without_a_folder_are_refused() -> None:
+    with pytest.raises(ValidationError, match="got ring_s without `folder`"):
+        LiveConfig(ring_s=10.0)

@@ -14,27 +14,66 @@ from collections import deque
 from pathlib import Path
 
 import numpy as np
+from pydantic import Field, model_validator
 
 from vlagents_ray.dataset_contract import GRIPPER
 from vlagents_ray.errors import InvalidInput, Overloaded, StorageFailed
 from vlagents_ray.images.jpeg_png import decode
 from vlagents_ray.interface import Obs
 from vlagents_ray.registry import require
-from vlagents_ray.serve.config.deployment import LiveArgs
+from vlagents_ray.serve.config.deployment import AbsolutePath
+from vlagents_ray.serve.config.parts import PartConfig
 from vlagents_ray.serve.models.loaded_model import LoadedModel
-from vlagents_ray.serve.observers.episodes import EpisodeWriter, RecordedAct, RecordingEnded
-from vlagents_ray.serve.observers.live import ENCODING_SHARE, RATE, KeptObservation, LiveObserver
 from vlagents_ray.serve.periodic import Periodic
 from vlagents_ray.serve.sessions import SessionTable
+from vlagents_ray_live.episodes import EpisodeWriter, RecordedAct, RecordingEnded
+from vlagents_ray_live.live import ENCODING_SHARE, RATE, KeptObservation, LiveObserver
 
 _PIXELS = 2**25  # maximum number of pixels of all pictures of a frame
+
+
+class LiveConfig(PartConfig):
+    """The settings of the live page: the last seconds of each session, which a button of the page saves."""
+
+    folder: AbsolutePath | None = Field(
+        default=None,
+        description="folder of the datasets, on each replica's own node or shared; each replica writes its own below "
+        "it. Unset: nothing is kept",
+    )
+    ring_s: float = Field(default=30.0, gt=0, le=600, description="how much of each session is held, s")
+    memory_mb: float = Field(
+        default=256.0,
+        gt=0,
+        le=1_000_000,
+        description="memory that all sessions of a replica take at most, MB; the oldest goes first",
+    )
+    most_gb: float = Field(
+        default=50.0, gt=0, le=1_000_000, description="size of the folder at which nothing more is saved, GB"
+    )
+
+    @model_validator(mode="after")
+    def _with_a_folder(self) -> LiveConfig:
+        if self.folder is None:
+            changed = [name for name, field in type(self).model_fields.items() if getattr(self, name) != field.default]
+            if changed:
+                raise ValueError(f"got {', '.join(changed)} without `folder`, so that nothing is kept; name a folder")
+        return self
 
 
 class Ring:
     """The last seconds of the sessions of one replica, from `open` to `close`."""
 
-    def __init__(self, live: LiveObserver, sessions: SessionTable[LoadedModel], settings: LiveArgs, name: str) -> None:
-        """Create an empty buffer; its episodes go to datasets whose names begin with the replica's `name`.
+    def __init__(
+        self,
+        live: LiveObserver,
+        sessions: SessionTable[LoadedModel],
+        folder: Path,
+        settings: LiveConfig,
+        name: str,
+    ) -> None:
+        """Create an empty buffer.
+
+        Its episodes go to datasets below `folder`, whose names begin with the replica's `name`.
 
         Raises:
             MissingDependency: The extra "record" is not installed.
@@ -43,8 +82,7 @@ class Ring:
             require(module)
         self.bytes = 0  # size of the held frames
         self._live, self._sessions, self._settings = live, sessions, settings
-        folder, most_bytes = Path(settings.folder), settings.most_gb * 1e9
-        self._writer = EpisodeWriter(folder, name, RATE, lossless=False, most_bytes=most_bytes)
+        self._writer = EpisodeWriter(folder, name, RATE, lossless=False, most_bytes=settings.most_gb * 1e9)
         self._frames: dict[str, deque[KeptObservation]] = {}  # by session
         self._lock = threading.Lock()  # guards `_frames`
         self._saving = threading.Lock()  # guards `_writer`
@@ -100,7 +138,7 @@ class Ring:
                 self._writer.add(session, _recorded(frames.popleft()))
             return str(self._writer.end(session))
         except RecordingEnded as error:
-            raise StorageFailed(f"live.folder: {error}; make room there") from error
+            raise StorageFailed(f"parts.live.folder: {error}; make room there") from error
         finally:
             self._writer.drop(session)  # remains of a failed attempt
             self._saving.release()

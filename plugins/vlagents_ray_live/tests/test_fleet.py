@@ -13,8 +13,8 @@ from live_server import METADATA
 from vlagents_ray.errors import UnknownSession
 from vlagents_ray.policies.noop import Noop
 from vlagents_ray.serve.engine.engine import Engine
-from vlagents_ray.serve.observers import live_view
-from vlagents_ray.serve.observers.live_view import PICTURES, Fleet, ReplicaView, Snapshot, SnapshotReader, Viewer
+from vlagents_ray_live import live_view
+from vlagents_ray_live.live_view import PICTURES, Fleet, ReplicaView, Snapshot, SnapshotReader, Viewer
 
 
 class Others:

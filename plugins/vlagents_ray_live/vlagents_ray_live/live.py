@@ -21,8 +21,8 @@ import numpy as np
 from vlagents_ray.images.codecs import JPEG
 from vlagents_ray.protocol.messages import Reply
 from vlagents_ray.serve.engine.observer import Observer, Observers
-from vlagents_ray.serve.observers.commands import CommandBoard
 from vlagents_ray.serve.requests import PendingRequest
+from vlagents_ray_live.commands import CommandBoard
 
 ENCODING_SHARE = 0.04  # share of a core for encoding pictures
 RATE = 10.0  # maximum rate of kept observations per session, Hz

@@ -44,15 +44,22 @@ from starlette.websockets import WebSocket, WebSocketDisconnect
 from vlagents_ray.errors import ConfigError, MalformedMessage, MessageTooLarge, Overloaded, VLAgentsError
 from vlagents_ray.page_protocol import BACKLOG, PageProtocol
 from vlagents_ray.protocol.json_messages import problem
-from vlagents_ray.protocol.messages import is_loopback
-from vlagents_ray.serve.access.api_keys import Caller, Keys, ScopeCheck, caller_name, current_caller
+from vlagents_ray.serve.access.api_keys import (
+    Caller,
+    Keys,
+    ScopeCheck,
+    caller_name,
+    current_caller,
+    require_watch_keys,
+)
 from vlagents_ray.serve.access.audit import log_pressed
 from vlagents_ray.serve.access.origin_check import require_same_origin
-from vlagents_ray.serve.endpoints.access_middleware import LIVE_PAGE, AccessMiddleware
+from vlagents_ray.serve.endpoints.access_middleware import AccessMiddleware
 from vlagents_ray.serve.endpoints.front import FrontMiddleware
 from vlagents_ray.serve.endpoints.http_messages import answer_error, deny, html_response
-from vlagents_ray.serve.observers.live_view import Fleet
+from vlagents_ray_live.live_view import Fleet
 
+PAGE = "/live"
 PATH = "/v1/live"
 _PROTOCOL = "vlagents.live"
 _COMMAND = f"{PATH}/command"
@@ -80,7 +87,7 @@ def live_routes(fleet: Fleet, *, open_to_network: bool, videos: VideoFiles | Non
     """
     endpoint = _LiveEndpoint(fleet, open_to_network, videos)
     routes: list[BaseRoute] = [
-        Route(LIVE_PAGE, _page),
+        Route(PAGE, _page),
         Route(PATH, endpoint.show),
         WebSocketRoute(PATH, endpoint.watch),
     ]
@@ -206,22 +213,12 @@ async def _page(_: HttpRequest) -> Response:
 @cache
 def live_page() -> list[str]:
     """Return the page with its style and scripts included, then the style, then the scripts."""
-    folder = package_files("vlagents_ray.serve.observers") / "page"
+    folder = package_files(__package__) / "page"
     parts = {name: folder.joinpath(name).read_text(encoding="utf-8") for name in ("live.css", *_SCRIPTS)}
     html = folder.joinpath("live.html").read_text(encoding="utf-8")
     for name, part in parts.items():
         html = html.replace(f"/* {name} */", part)
     return [html, *parts.values()]
-
-
-def require_watch_keys(host: str, keys: Keys | None) -> None:
-    """Raise `ConfigError` if other machines would reach a page on `host` without a key."""
-    if keys is None and not is_loopback(host):
-        raise ConfigError(
-            f"live page on {host}: without keys all cameras would be public. Make a key (`vlagents-ray keys new NAME "
-            f"--scope watch --file keys.json`) and set VLAGENTS_RAY_KEYS_FILE=keys.json; or stay on loopback, and look "
-            f"at it through `ssh -L`"
-        )
 
 
 @contextmanager
@@ -248,7 +245,8 @@ def page_server(
             f"live page: cannot listen on {host}:{port} ({error.strerror}); choose another port"
         ) from error
     routes, handlers = live_routes(fleet, open_to_network=False, videos=videos), {VLAgentsError: answer_error}
-    app = FrontMiddleware(AccessMiddleware(Starlette(routes=routes, exception_handlers=handlers), keys, name))
+    inside = Starlette(routes=routes, exception_handlers=handlers)
+    app = FrontMiddleware(AccessMiddleware(inside, keys, name, public=[PAGE]))
     config = uvicorn.Config(
         app,
         log_config=None,
@@ -263,7 +261,7 @@ def page_server(
     thread = threading.Thread(target=lambda: asyncio.run(server.serve([listening])), name="live-page", daemon=True)
     thread.start()
     try:
-        yield f"http://{f'[{host}]' if ':' in host else host}:{listening.getsockname()[1]}{LIVE_PAGE}"
+        yield f"http://{f'[{host}]' if ':' in host else host}:{listening.getsockname()[1]}{PAGE}"
     finally:
         if fleet.viewers:
             time.sleep(_LAST_S)

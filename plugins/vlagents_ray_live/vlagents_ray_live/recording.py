@@ -1,5 +1,7 @@
 """Records requests and answers of sessions as LeRobotDatasets; other threads copy, encode and write them.
 
+A deployment file turns it on: `parts: {record: {folder: /data/traces}}`.
+
 The thread that handles a message only puts references into a queue. A second thread copies the observations, since
 their memory may belong to the client, and a third one encodes and writes. If these are too slow, or the disk is full,
 frames are dropped and counted; they delay no answer.
@@ -14,27 +16,34 @@ import re
 import tempfile
 import threading
 import time
+from collections import Counter as Counts
 from collections.abc import Callable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from queue import SimpleQueue
-from typing import Any
+from typing import Any, Literal
+
+from pydantic import Field
+from ray.util.metrics import Counter, Gauge
 
 from vlagents_ray.errors import ConfigError, PolicyFailed, UnknownSession
 from vlagents_ray.interface import CAPTURED, POLICY, Obs, copied
 from vlagents_ray.protocol.messages import Reply
 from vlagents_ray.protocol.values import to_text
 from vlagents_ray.registry import require
-from vlagents_ray.serve.config.deployment import RecordArgs
+from vlagents_ray.serve.config.deployment import AbsolutePath
+from vlagents_ray.serve.config.parts import PartConfig
 from vlagents_ray.serve.engine.metrics_buffer import STAGES
 from vlagents_ray.serve.engine.observer import Observer
 from vlagents_ray.serve.models.loaded_model import LoadedModel
-from vlagents_ray.serve.observers.episodes import EpisodeWriter, RecordedAct, RecordingEnded
-from vlagents_ray.serve.periodic import each_half_second
+from vlagents_ray.serve.periodic import Periodic, each_half_second
+from vlagents_ray.serve.replica.metrics import PERIOD_S, series
+from vlagents_ray.serve.replica.part import ReplicaPart
 from vlagents_ray.serve.requests import PendingRequest
 from vlagents_ray.serve.sessions import SessionTable
+from vlagents_ray_live.episodes import EpisodeWriter, RecordedAct, RecordingEnded
 
 logger = logging.getLogger(__name__)
 
@@ -43,6 +52,80 @@ _HELD_BYTES = 256 * 2**20  # maximum size of the observations that wait to be wr
 _OTHER_BYTES = 16 * 2**10  # estimated size of an act besides its pictures and the bytes in its `info`
 _NICE = 5  # lower priority than the policy's thread
 _CLOSING_S = 30.0  # time for the threads to write the waiting frames
+
+
+class RecordConfig(PartConfig):
+    """The settings of a recording."""
+
+    folder: AbsolutePath = Field(
+        description="folder of the datasets, on each replica's own node or shared; each replica writes its own below it"
+    )
+    share: float = Field(default=1.0, gt=0, le=1, description="share of the episodes, drawn at each reset")
+    pictures: Literal["exact", "small"] = Field(
+        default="exact",
+        description="exact: each pixel as the policy got it, in lossless H.264; small: as videos for training, some "
+        "twenty times smaller, on which the same policy acts a little differently",
+    )
+    fps: float = Field(
+        default=10.0, gt=0, le=10_000, description="rate of the frames, one for each act, that the videos assume"
+    )
+    most_gb: float = Field(
+        default=50.0, gt=0, le=1_000_000, description="size of the folder at which the recording ends, GB"
+    )
+
+
+class Recording(ReplicaPart):
+    """Records the sessions of a replica, and exports how many frames are saved and lost."""
+
+    Config = RecordConfig
+
+    def open(self) -> None:
+        """Start to record; raises `ConfigError` or `MissingDependency` as `open_recorder` does."""
+        context = self.context
+        self.recorder = open_recorder(context.engine.sessions, self.settings, context.replica, context.metadata)
+        self._metrics = RecordingMetrics(self.recorder, context.metric_tags)
+        self._metrics.start()
+
+    def observer(self) -> SessionRecorder:
+        """Return the recorder."""
+        return self.recorder
+
+    def close(self) -> None:
+        """Export the last counts."""
+        self._metrics.close()
+
+
+class RecordingMetrics:
+    """Exports the counts of a recorder to Ray once a second, on a separate thread."""
+
+    def __init__(self, recorder: SessionRecorder, tags: Mapping[str, str]) -> None:
+        """Create the series of a replica with these `tags`."""
+        make = partial(series, tags)
+        self._frames = make(Counter, "recorded_frames", "Acts of recorded sessions.", "outcome")
+        # 1 while sessions are recorded, 0 once that has ended.
+        self._recording = make(Gauge, "recording", "Whether sessions are recorded.")
+        self._recorder = recorder
+        self._exported = Counts[str]()  # exported part of the recorder's counts
+        self._periodic = Periodic(PERIOD_S)
+
+    def start(self) -> None:
+        """Start to export the counts."""
+        self._periodic.add(self.export)
+
+    def close(self) -> None:
+        """Export the last counts, and end the thread."""
+        self._periodic.remove(self.export)
+        self.export()
+
+    def export(self) -> None:
+        """Export the counts since the last call."""
+        self._recording.set(float(self._recorder.ended is None))
+        totals = {"saved": self._recorder.saved, "lost": self._recorder.lost}
+        for outcome, total in totals.items():
+            new = total - self._exported[outcome]
+            if new:
+                self._frames.inc(new, {"outcome": outcome})
+                self._exported[outcome] = total
 
 
 class Worker:
@@ -247,7 +330,7 @@ class SessionRecorder(Observer):
 
 
 def open_recorder(
-    sessions: SessionTable[LoadedModel], args: RecordArgs, replica: str, metadata: Callable[[], Mapping[str, Any]]
+    sessions: SessionTable[LoadedModel], args: RecordConfig, replica: str, metadata: Callable[[], Mapping[str, Any]]
 ) -> SessionRecorder:
     """Create a recorder of the sessions of a replica.
 
@@ -262,7 +345,7 @@ def open_recorder(
         folder.mkdir(mode=0o700, parents=True, exist_ok=True)
         tempfile.TemporaryFile(dir=folder).close()
     except OSError as error:
-        raise ConfigError(f"record.folder: {folder} cannot be written to ({error})") from error
+        raise ConfigError(f"parts.record.folder: {folder} cannot be written to ({error})") from error
     name = re.sub(r"[^A-Za-z0-9]+", "-", replica.removeprefix("SERVE_REPLICA::"))
     writer = EpisodeWriter(
         folder,

@@ -12,6 +12,7 @@ from vlagents_ray.protocol.messages import Reply
 from vlagents_ray.registry import require
 from vlagents_ray.serve.engine.observer import Observer
 from vlagents_ray.serve.periodic import each_half_second
+from vlagents_ray.serve.replica.part import ReplicaPart
 from vlagents_ray.serve.requests import PendingRequest
 
 _KEPT = 4096  # maximum number of answers per half second; older ones get no spans
@@ -96,6 +97,15 @@ class RequestSpans(Observer):
 
     def _stage(self, name: str, inside: Any, begun_ns: int, ended_ns: int) -> None:
         self._tracer.start_span(name, inside, start_time=begun_ns).end(ended_ns)
+
+
+class Spans(ReplicaPart):
+    """Creates spans of requests if the environment of the replica enables traces, see `vlagents_ray.tracing`."""
+
+    def observer(self) -> RequestSpans | None:
+        """Return the observer of requests; None without traces."""
+        tracer = tracing.tracer()
+        return None if tracer is None else RequestSpans(tracer, self.context.short_name)
 
 
 def _ns(milliseconds: float) -> int:

@@ -1,0 +1,1 @@
+"""Parts of a server that show and keep its sessions."""

@@ -1,0 +1,43 @@
+"""The live page of an evaluation, which the process that runs it serves: `eval --live` and `report --live`."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Iterator
+from contextlib import contextmanager
+
+from vlagents_ray.evaluate.report.evaluation_page import EvaluationPage
+from vlagents_ray.evaluate.report.results_document import ResultsDocument
+from vlagents_ray.serve.access.api_keys import Keys
+from vlagents_ray.serve.replica.part import SiblingPart
+from vlagents_ray_live.live_page import page_server
+from vlagents_ray_live.live_view import Fleet
+from vlagents_ray_live.sibling_views import METHODS, SiblingViews
+
+_PART = "live"  # name of the part of the policies' replicas
+_NAME = "eval"  # the page's application, for keys that are limited to applications
+
+
+class LiveEvaluationPage(EvaluationPage):
+    """Shows progress and results, and the sessions of the policies' replicas."""
+
+    @contextmanager
+    def serve(
+        self, document: ResultsDocument, apps: Collection[str], address: tuple[str, int], keys: Keys | None
+    ) -> Iterator[str]:
+        """Serve the page on a thread; see `EvaluationPage.serve`."""
+        others = _views(apps) if apps else None
+        fleet = Fleet(None, others, document.read)
+        with page_server(fleet, address, keys, name=_NAME, videos=document.video) as url:
+            yield url
+
+
+def _views(apps: Collection[str]) -> SiblingViews:
+    """Return the views of all replicas of applications in this process's cluster."""
+    from vlagents_ray.serve.scaling.sibling_replicas import ReplicasInCluster
+
+    replicas = ReplicasInCluster(apps)
+
+    async def live_parts() -> list[SiblingPart]:
+        return [SiblingPart(replica, _PART, METHODS) for replica in await replicas.others()]
+
+    return SiblingViews(live_parts)

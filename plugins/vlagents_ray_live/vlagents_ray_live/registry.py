@@ -1,0 +1,26 @@
+"""What this distribution registers: an entry for each part of a replica, and one for the page of evaluations."""
+
+from vlagents_ray.registry import RegistryEntry
+
+LIVE = RegistryEntry(
+    "vlagents_ray_live.part:LivePart",
+    "Shows the sessions on a page, `/live`, and stops their robots from there.",
+    by_default=True,
+)
+
+EVALUATION_PAGE = RegistryEntry(
+    "vlagents_ray_live.evaluation_page:LiveEvaluationPage",
+    "Shows an evaluation while it runs: `eval --live`, `report --live`.",
+)
+
+RECORD = RegistryEntry(
+    "vlagents_ray_live.recording:Recording",
+    "Records sessions as LeRobotDatasets.",
+    needs=("av", "pyarrow"),
+)
+
+SPANS = RegistryEntry(
+    "vlagents_ray_live.spans:Spans",
+    "Exports OpenTelemetry spans of requests if VLAGENTS_RAY_OTEL=1 is set.",
+    by_default=True,
+)

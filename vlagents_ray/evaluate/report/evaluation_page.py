@@ -1,0 +1,32 @@
+"""The interface of a page that shows an evaluation while it runs, which a plug-in registers in `vlagents_ray.pages`."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Collection
+from contextlib import AbstractContextManager
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from vlagents_ray.evaluate.report.results_document import ResultsDocument
+    from vlagents_ray.serve.access.api_keys import Keys
+
+
+class EvaluationPage(ABC):
+    """A page that shows an evaluation while it runs."""
+
+    @abstractmethod
+    def serve(
+        self, document: ResultsDocument, apps: Collection[str], address: tuple[str, int], keys: Keys | None
+    ) -> AbstractContextManager[str]:
+        """Serve the page for the length of the context, which yields its URL.
+
+        Args:
+            document: The progress and the results.
+            apps: The applications in this process's cluster whose sessions are shown.
+            address: Host and port to listen on; port 0 selects a free one.
+            keys: The accepted keys; None admits all clients, which only loopback allows.
+
+        Raises:
+            ConfigError: Other machines would reach the page without a key, or the address is in use.
+        """

@@ -1,1 +1,0 @@
-"""Observers of the requests and answers of a replica: the live page, recordings and traces."""
