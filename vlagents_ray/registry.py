@@ -370,7 +370,11 @@ def registered_class(kind: str, name: str, unknown: type[ConfigError] = ConfigEr
 
 
 def registered_function(kind: str, name: str) -> Any:
-    """Return the function registered as `name`, or "module:function"; raises `ConfigError` if there is none."""
+    """Return the function or `typer.Typer` registered as `name`, or given as "module:function".
+
+    Raises:
+        ConfigError: There is none, or it cannot be loaded, for whatever reason; the message names the plug-in.
+    """
     return load_target(_importable_target(kind, name, ConfigError))
 
 
@@ -392,15 +396,6 @@ def _importable_target(kind: str, name: str, unknown: type[ConfigError]) -> str:
             f"{name!r} is not registered: want one of {sorted(known)}, or 'module:Class'{did_you_mean(name, known)}"
         )
     return target
-
-
-def load_command(name: str) -> Any:
-    """Return the function or `typer.Typer` of a command that a plug-in registers.
-
-    Raises:
-        ConfigError: It cannot be loaded, for whatever reason; the message names the plug-in.
-    """
-    return registered_function("commands", name)
 
 
 def _shown(kind: str, name: str) -> str:

@@ -29,7 +29,7 @@ from vlagents_ray.client.commands import CommandInbox
 from vlagents_ray.errors import ConfigError, VLAgentsError, printable
 from vlagents_ray.interface import Agent
 from vlagents_ray.naming import did_you_mean
-from vlagents_ray.registry import entries, load_command, names, not_installed, pip_install
+from vlagents_ray.registry import entries, names, not_installed, pip_install, registered_function
 from vlagents_ray.robot.fit import Fit, Trained
 from vlagents_ray.robot.leaders import leader_named
 from vlagents_ray.robot.limits import Limits
@@ -94,7 +94,7 @@ def main(arguments: Sequence[str]) -> int:
 def _run_subcommand(name: str, arguments: Sequence[str]) -> int:
     """Run a subcommand that a plug-in registers, such as "robot.check", and return its exit status."""
     try:
-        run: Callable[[Sequence[str]], int] = load_command(name)
+        run: Callable[[Sequence[str]], int] = registered_function("commands", name)
     except VLAgentsError as error:
         print(printable(f"{type(error).__name__}: {error}"), file=sys.stderr)  # noqa: T201
         return 2
