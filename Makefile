@@ -52,14 +52,16 @@ TEST_PROCESSES ?= 3
 CHECK_PROCESSES ?= 4
 # Marked so: what wants more than Python, takes long, or wants the machine for itself (pyproject.toml, tests/support/needs.py).
 NOT_QUICK := ray or server or hosts or sim or vulkan or torch or gpu or browser or node or compiler or alone or slow or integration
-# Environments of model families: requirements/NAME.txt, in $(VENV)-NAME. What is tested in each is in the folders
-# families/NAME of tests/ and of the plug-ins' tests. Those whose code is on no package index want its source, too: OPENPI_SRC, OPENVLA_SRC,
+# Environments of model families and simulators, in $(VENV)-NAME: NAME.txt in requirements/ of a plug-in, or here. What is
+# tested in each is in the folders families/NAME of tests/ and of the plug-ins' tests. Those whose code is on no package
+# index want its source, too: OPENPI_SRC, OPENVLA_SRC,
 # OPENVLA_OFT_SRC, OCTO_SRC, DIFFUSION_POLICY_SRC, VJEPA2_SRC, GR00T_SRC.
 # ros is a ROS 2 of its own; it wants Python 3.11.
 # lerobot06 wants Python 3.12, and TORCH_CUDA=1 where no index has a torch without CUDA for it: several GB.
 # calvin wants CALVIN_SRC, a checkout.
 # robocasa is only tested where it is named: 1.3 GB, and a minute.
 FAMILIES ?= libero libero_pro lerobot hf rcs ros torchrl
+REQUIREMENTS := $(wildcard plugins/*/*/requirements)
 TESTS_OF = $(foreach family,$(1),$(wildcard tests/families/$(family) plugins/*/tests/families/$(family)))
 TESTED_IN_libero := libero robosuite
 TESTED_IN_hf := pi0 arro vjepa2_ac
@@ -151,7 +153,8 @@ programs: setup $(patsubst %,$(VENV)-%/.installed,$(filter lerobot%,$(FAMILIES))
 
 # Made once for each state of the family's requirements, of what a server installs and of what `env make` adds: not removed as a mere step.
 .PRECIOUS: $(VENV)-%/.installed
-$(VENV)-%/.installed: requirements/%.txt requirements/testing.txt $(wildcard requirements/*.cpu.txt) $(VENV)/server.txt \
+vpath %.txt requirements $(REQUIREMENTS)
+$(VENV)-%/.installed: %.txt requirements/testing.txt $(wildcard $(REQUIREMENTS:%=%/*.cpu.txt)) $(VENV)/server.txt \
     $(PROJECTS) \
     vlagents_ray/policies/base/import_fixes.py
 	$(BIN)/vlagents-ray env make $< $(addprefix --with ,requirements/testing.txt $(wildcard requirements/$*.testing.txt)) \

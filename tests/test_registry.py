@@ -14,10 +14,11 @@ import tomllib
 
 import vlagents_ray
 from vlagents_ray import registry
-from vlagents_ray.errors import MissingDependency, UnknownEnv, UnknownPolicy
+from vlagents_ray.errors import ConfigError, MissingDependency, UnknownEnv, UnknownPolicy
 
 ROOT = Path(vlagents_ray.__file__).parents[1]
 FAMILIES = ["diffusion_policy", "gr00t", "hf", "lerobot", "octo", "openpi", "openvla"]
+REQUIREMENTS = {name: registry.requirements_file(name).read_text() for name in FAMILIES}
 
 
 @pytest.fixture
@@ -36,6 +37,12 @@ def cure(module: str) -> str:
     return str(caught.value).partition("; ")[2]
 
 
+def environments_in(text: str) -> list[str]:
+    """The names for `vlagents-ray env make` in a cure."""
+    _, _, several = text.partition("; NAME is that of the policy's family: ")
+    return several.split(", ") if several else re.findall(r"env make (\w+)", text)
+
+
 @pytest.mark.usefixtures("nothing_installed")
 @pytest.mark.parametrize(
     ("module", "files"),
@@ -52,8 +59,8 @@ def cure(module: str) -> str:
 def test_a_missing_model_package_is_cured_by_its_requirements_file(module: str, files: list[str]) -> None:
     text = cure(module)
     assert "pip install" not in text, "an extra of this package would not bring it"
-    assert "vlagents-ray env make requirements/" in text
-    assert re.findall(r"(\w+)\.txt", text) == files
+    assert "vlagents-ray env make " in text
+    assert environments_in(text) == files
 
 
 @pytest.mark.usefixtures("nothing_installed")
@@ -97,18 +104,14 @@ def test_the_extras_and_files_that_cures_name_exist() -> None:
         assert entry.extra is None or entry.extra in project["optional-dependencies"]
     assert {one.requirements[0] for one in registry.entries("policies").values() if one.requirements} == set(FAMILIES)
     for file in {file for one in adapters for file in one.requirements}:
-        assert (ROOT / f"requirements/{file}.txt").exists()
+        assert registry.requirements_file(file).exists()
 
 
 @pytest.mark.parametrize("package", ["torch", "transformers", "jax", "flax", "timm"])
 @pytest.mark.usefixtures("nothing_installed")
 def test_a_cure_names_each_file_that_lists_the_package(package: str) -> None:
-    listed = [
-        name
-        for name in FAMILIES
-        if re.search(rf"(?m)^{package}\b(?!-)", (ROOT / f"requirements/{name}.txt").read_text())
-    ]
-    assert set(listed) <= set(re.findall(r"(\w+)\.txt", cure(package)))
+    listed = [name for name in FAMILIES if re.search(rf"(?m)^{package}\b(?!-)", REQUIREMENTS[name])]
+    assert set(listed) <= set(environments_in(cure(package)))
 
 
 def test_an_unknown_name_raises_the_error_of_its_kind() -> None:
@@ -116,3 +119,18 @@ def test_an_unknown_name_raises_the_error_of_its_kind() -> None:
         registry.policy_class("scriptd")
     with pytest.raises(UnknownEnv, match=r"'tabletopp' is not registered.*did you mean 'tabletop'"):
         registry.env_class("tabletopp/reach")
+
+
+def test_requirements_are_found_in_the_package_that_registers_them_and_others_are_refused() -> None:
+    assert registry.requirements_file("hf").parent.parent.name == "vlagents_ray_models"
+    assert registry.requirements_file("rcs").parent.parent.name == "vlagents_ray_sims"
+    with pytest.raises(ConfigError, match=r"requirements 'lerobt': expected a file.*did you mean 'lerobot'"):
+        registry.requirements_file("lerobt")
+
+
+def test_requirements_of_a_plugin_that_is_not_installed_are_an_error_that_names_it(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(registry, "published", lambda: {"policies": {"pi9": "vlagents-ray-more"}})
+    with pytest.raises(ConfigError, match="more are in vlagents-ray-more, not installed here"):
+        registry.requirements_file("pi9")

@@ -18,6 +18,7 @@ import logging
 import sys
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from importlib import resources
 from importlib.metadata import EntryPoint, entry_points
 from pathlib import Path
 from types import MappingProxyType, ModuleType
@@ -42,7 +43,8 @@ class RegistryEntry:
     # Its models or tasks, for the tables of README and docs/; empty: no row in them. Of others, one line for --help.
     about: str = ""
     needs: tuple[str, ...] = ()  # import names; the first one may be in a source named by `checkouts`
-    requirements: tuple[str, ...] = ()  # files of requirements/ that install these, the usual one first
+    # Files NAME.txt in `requirements/` of the target's package that install these, the usual one first.
+    requirements: tuple[str, ...] = ()
     extra: str | None = None  # extra of its distribution that installs them
     checkouts: tuple[str, ...] = ()  # variables, one of which names a checkout of the authors' code
     wants: str = ""  # further requirements of its users, such as "assets"
@@ -203,16 +205,17 @@ def _install(package: str, extra: str | None = None, distribution: str = CORE) -
         return pip_install(with_extra.extra, with_extra.distribution)
     if simulators:
         return (
-            f"run `vlagents-ray env make requirements/{simulators[0].requirements[0]}.txt` and give the evaluation's "
+            f"run `vlagents-ray env make {simulators[0].requirements[0]}` and give the evaluation's "
             f"workers that environment's Python, `runtime_env: {{py_executable: ...}}`"
         )
     needed = _BROUGHT.get(package, package)
     families = [entry for entry in policies if entry.requirements and needed in entry.needs]
-    files = sorted({f"{entry.requirements[0]}.txt" for entry in families})
-    if files:
-        family = f"; FILE is that of the policy's family: {', '.join(files)}" if len(files) > 1 else ""
+    environments = sorted({entry.requirements[0] for entry in families})
+    if environments:
+        several = len(environments) > 1
+        family = f"; NAME is that of the policy's family: {', '.join(environments)}" if several else ""
         return (
-            f"run `vlagents-ray env make requirements/{'FILE' if family else files[0]}` and name the environment in "
+            f"run `vlagents-ray env make {'NAME' if several else environments[0]}` and name the environment in "
             f"the deployment's `environment`{family}"
         )
     return _ELSEWHERE.get(package, f"install the package that provides {package!r}")
@@ -224,6 +227,26 @@ def require_needs(kind: str, name: str) -> None:
     if entry is not None:
         for module in entry.needs:
             require(module, extra=entry.extra, distribution=entry.distribution)
+
+
+def requirements_file(name: str) -> Path:
+    """Return the requirements file that a policy or environment names, such as "hf", in its package.
+
+    Raises:
+        ConfigError: No installed policy or environment names it.
+    """
+    named: dict[str, RegistryEntry] = {}
+    for entry in (*entries("policies").values(), *entries("envs").values()):
+        named.update(dict.fromkeys(entry.requirements, entry))
+    if name not in named:
+        absent = sorted({*not_installed("policies").values(), *not_installed("envs").values()})
+        more = f"; more are in {', '.join(absent)}, not installed here" if absent else ""
+        raise ConfigError(
+            f"requirements {name!r}: expected a file, such as needs.txt, or one of {sorted(named)}"
+            f"{did_you_mean(name, named)}{more}"
+        )
+    package = named[name].target.partition(":")[0].partition(".")[0]
+    return Path(str(resources.files(package).joinpath("requirements", f"{name}.txt")))
 
 
 def pip_install(extra: str | None = None, distribution: str = CORE) -> str:

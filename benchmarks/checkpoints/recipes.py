@@ -25,7 +25,7 @@ class Family:
     """A family of policies."""
 
     module: str  # of this folder
-    environment: str  # the name of its file in requirements/
+    environment: str  # the name of its requirements: `vlagents-ray env make NAME`
     packages: tuple[str, ...]  # of that environment
     dtypes: tuple[str, ...] = ("bfloat16", "float32")  # of the weights, the usual one first
 
@@ -65,7 +65,7 @@ def write_checkpoint(family: str, folder: Path, size: SizeName = "full", dtype: 
     if missing := [name for name in known.packages if importlib.util.find_spec(name) is None]:
         raise MissingDependency(
             f"{family}: {sys.executable} has no {', '.join(missing)}; run this command in the family's environment: "
-            f"`vlagents-ray env make requirements/{known.environment}.txt --out .venv-{known.environment}`, then "
+            f"`vlagents-ray env make {known.environment} --out .venv-{known.environment}`, then "
             f"`.venv-{known.environment}/bin/python -m benchmarks.checkpoints {family} {folder}`"
         )
     folder = folder.absolute()

@@ -25,7 +25,7 @@ PACKAGES = (
 )  # fmt: skip
 THERE = ("numpy", "torch", "hf_xet")  # with torch; hf_xet only serves downloads
 PLATFORMS = ("manylinux_2_28", "manylinux_2_27", "manylinux_2_24", "manylinux_2_17", "manylinux2014", "manylinux1")
-FOLDERS = ("vlagents_ray", "benchmarks", "requirements", "pyproject.toml", "conftest.py", "tests/__init__.py",
+FOLDERS = ("vlagents_ray", "benchmarks", "pyproject.toml", "conftest.py", "tests/__init__.py",
            "tests/support", "tests/policies/compilation", "plugins/vlagents_ray_learn/tests")  # fmt: skip
 RUN = """#!/bin/bash
 # Measures all that needs a GPU: bash run.sh [OPTIONS of python -m benchmarks.gpu]. The report is in $OUT or build/gpu.

@@ -26,13 +26,14 @@ from benchmarks.drivers import START_S, ClientProcess, ProcessDriver
 from benchmarks.processes import descendants
 from benchmarks.round_trips import LOOPBACK, StartClient
 from vlagents_ray.errors import ConfigError
+from vlagents_ray.registry import requirements_file
 from vlagents_ray.serve.ports import free_port
 from vlagents_ray_cluster.tune.line_process import LineProcess
 
 SCRIPTS = Path(__file__).parent
 REQUIREMENTS = SCRIPTS / "requirements.txt"
 TORCH, TORCH_REQUIREMENTS = "-torch", SCRIPTS / "requirements-torch.txt"  # the end of a second environment's name
-CPU = SCRIPTS.parents[1] / "requirements" / "lerobot.cpu.txt"  # what LeRobot gets without a GPU
+CPU = requirements_file("lerobot").with_suffix(".cpu.txt")  # what LeRobot gets without a GPU
 FOLDER = Path(".venv-peers")
 PYTHON = FOLDER / "bin" / "python"
 

@@ -103,8 +103,8 @@ def test_what_installs_the_rest_is_said_once_for_all_that_want_it(
     assert rest[0] == "for the rest, whose Python a deployment names as `environment`:"
     of_hf = sorted(name for name, one in entries("policies").items() if one.requirements[:1] == ("hf",))
     assert {"pi0", "vjepa2_ac"} <= set(of_hf)
-    assert f"  vlagents-ray env make requirements/hf.txt  # {', '.join(of_hf)}" in rest
-    assert "  vlagents-ray env make requirements/openvla.txt  # openvla, openvla_oft" in rest
+    assert f"  vlagents-ray env make hf  # {', '.join(of_hf)}" in rest
+    assert "  vlagents-ray env make openvla  # openvla, openvla_oft" in rest
     assert "  export VJEPA2_SRC=FOLDER  # a checkout, for vjepa2_ac" in rest
     assert not any("OPENVLA" in line for line in rest)
     assert "  onnx: not in this environment (onnxruntime): pip install 'vlagents-ray-models[onnx]'" in rest
@@ -120,7 +120,7 @@ def test_of_one_policy_all_is_said(shown: io.StringIO, monkeypatch: pytest.Monke
         "  settings: action_dim=7, delta=None, chunk=1, base_ms=0.0, per_item_ms=0.0",
     ]
     policies("openpi")
-    assert "requirements/openpi.txt`" in shown.getvalue()
+    assert "env make openpi`" in shown.getvalue()
     assert "OPENPI_SRC=FOLDER of a checkout" in shown.getvalue()
     with pytest.raises(typer.Exit) as ended:
         policies("opnpi")

@@ -211,6 +211,7 @@ COMMANDS: dict[str, tuple[list[str], list[str]]] = {
     "new: installed": (["new", "policy", "numpy"], ["'numpy'", "hide"]),
     "new: keyword": (["new", "policy", "class"], ["'class'", "module"]),
     "env make": (["env", "make", "nothing.txt"], ["nothing.txt", "requirements file"]),
+    "env make: misspelt": (["env", "make", "lerobt"], ["'lerobt'", "did you mean 'lerobot'"]),
     "tune: no file": (["tune", "noop"], ["deployment file", ".yaml"]),
     "tune: absent": (["tune", "nope.yaml"], ["nope.yaml", "does not exist"]),
     "policies: misspelt": (["policies", "opnpi"], ["'opnpi'", "'openpi'"]),

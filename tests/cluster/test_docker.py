@@ -1,6 +1,6 @@
 """cluster/docker: what the Dockerfile names is there, and nothing it should not have; each package by its digest.
 
-No container engine is needed. Locks get what pyproject.toml and requirements/ want.
+No container engine is needed. Locks get what pyproject.toml and the plug-ins' requirements/ want.
 """
 
 from __future__ import annotations

@@ -126,7 +126,7 @@ def _block(language: str, above: list[tuple[int, str]], code: list[tuple[int, st
 
 def checkout(folder: Path) -> None:
     """Put into `folder` what pages name as paths in a checkout."""
-    for name in ("cluster", "deployments", "evaluations", "examples", "reference", "requirements"):
+    for name in ("cluster", "deployments", "evaluations", "examples", "reference"):
         shutil.copytree(ROOT / name, folder / name)
 
 

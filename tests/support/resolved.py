@@ -1,4 +1,4 @@
-"""What uv resolves of pyproject.toml and requirements/: the table of docs/install.md, and the locks of the images.
+"""What uv resolves of pyproject.toml and the plug-ins' requirements: the table of docs/install.md, the images' locks.
 
 `python tests/support/resolved.py extras` writes the table again, `… locks` the locks, over the network.
 """
@@ -25,9 +25,8 @@ ROOT = Path(__file__).parents[2]
 PAGE = ROOT / "docs" / "install.md"
 LOCKS = ROOT / "cluster" / "docker" / "locks"
 TORCH = ROOT / "cluster" / "docker" / "torch.txt"
-FAMILIES = ROOT / "requirements"
-# A robot has its own ROS; RoboCasa wants 10 GB besides its packages, CALVIN a checkout; TorchRL learns beside a server.
-WITHOUT_IMAGE = {"testing", "ros", "robocasa", "calvin", "torchrl"}
+# RoboCasa wants 10 GB besides its packages, CALVIN a checkout.
+WITHOUT_IMAGE = {"robocasa", "calvin"}
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
 _PLUGIN_FILES = sorted(ROOT.glob("plugins/vlagents_ray_*/pyproject.toml"))
 PLUGINS = [tomllib.loads(file.read_text())["project"] for file in _PLUGIN_FILES]
@@ -157,7 +156,9 @@ def written(page: str) -> str:
 
 def families() -> list[Path]:
     """The requirements of families and simulators that have an image."""
-    return sorted(file for file in FAMILIES.glob("*.txt") if "." not in file.stem and file.stem not in WITHOUT_IMAGE)
+    files = ROOT.glob("plugins/*/*/requirements/*.txt")
+    with_image = (file for file in files if "." not in file.stem and file.stem not in WITHOUT_IMAGE)
+    return sorted(with_image, key=lambda file: file.stem)
 
 
 def simulators() -> list[str]:

@@ -37,7 +37,7 @@ WHAT = {
     "size": "has the published size",
 }
 PLUGINS = {"arro": "other#arro"}  # of packages in plugins/, with their place among the pages of the policies
-# Of each family: the files in requirements/, and the packages and checkouts whose versions matter.
+# Of each family: the names of its requirements, and the packages and checkouts whose versions matter.
 RUN_WITH = {
     name: (" ".join(one.requirements), (*one.checkouts, *one.needs[bool(one.checkouts) :]))
     for name, one in entries("policies").items()

@@ -90,7 +90,7 @@ def installing(listed: Sequence[Listed]) -> Iterator[str]:
     for one in listed:
         modules, sources, requirements = _lacking(one.name) if one.kind != "environment" else ([], [], "")
         if modules or sources:
-            wanted.setdefault(f"vlagents-ray env make requirements/{requirements}  # {{}}", []).append(one.name)
+            wanted.setdefault(f"vlagents-ray env make {requirements}  # {{}}", []).append(one.name)
         if sources:
             wanted.setdefault(f"export {sources[0]}=FOLDER  # a checkout, for {{}}", []).append(one.name)
         if one.missing is not None and not (modules or sources):
@@ -119,7 +119,7 @@ def missing_packages(name: str, *, checkout: bool = True) -> str | None:
     modules, sources, requirements = _lacking(name)
     if not modules and not (sources and checkout):
         return None
-    cures = [f"`vlagents-ray env make requirements/{requirements}`, and that Python in `environment` of its deployment"]
+    cures = [f"`vlagents-ray env make {requirements}`, and that Python in `environment` of its deployment"]
     if sources:
         cures.append(f"{' or '.join(sources)}=FOLDER of a checkout")
         modules = [*modules, "its source"]
@@ -127,14 +127,14 @@ def missing_packages(name: str, *, checkout: bool = True) -> str | None:
 
 
 def _lacking(name: str) -> tuple[list[str], list[str], str]:
-    """Return the modules and checkout variables that a family lacks, and its requirements file."""
+    """Return the modules and checkout variables that a family lacks, and the name of its requirements."""
     entry = find_entry("policies", name)
     if entry is None or not entry.requirements:
         return [], [], ""
     has_checkout = any(os.environ.get(variable) for variable in entry.checkouts)
     lacking = [module for module in entry.needs[has_checkout:] if importlib.util.find_spec(module) is None]
     no_source = bool(entry.checkouts) and not has_checkout and entry.needs[0] in lacking
-    return lacking[no_source:], list(entry.checkouts) if no_source else [], f"{entry.requirements[0]}.txt"
+    return lacking[no_source:], list(entry.checkouts) if no_source else [], entry.requirements[0]
 
 
 def settings_of(cls: type) -> Iterator[str]:

@@ -200,19 +200,20 @@ def _list(listed: Sequence[Listed], name: str | None, *, as_json: bool) -> None:
 
 @env.command("make")
 def make(
-    requirements: Annotated[Path, typer.Argument(help="A requirements file: requirements/lerobot.txt.")],
-    out_dir: Annotated[Path | None, typer.Option("--out", help="Folder; default: .venv- and the file's name.")] = None,
+    requirements: Annotated[Path, typer.Argument(help="A family's name, such as lerobot, or a requirements file.")],
+    out_dir: Annotated[Path | None, typer.Option("--out", help="Folder; default: .venv- and that name.")] = None,
     more: Annotated[list[Path], typer.Option("--with", help="A further requirements file, repeatable.")] = [],  # noqa: B006
     python: Annotated[str | None, typer.Option(help="Version or interpreter; default: the file's, or this.")] = None,
     light: Annotated[bool, typer.Option("--light", help="Without Ray, for a child process.")] = False,
     cuda: Annotated[bool, typer.Option("--cuda", help="CUDA packages also without a GPU: several GB.")] = False,
 ) -> None:
     """Make a virtual environment with this vlagents-ray and a policy's requirements, and print how to use it."""
+    from vlagents_ray.registry import requirements_file
     from vlagents_ray.serve.python_env.create import make_environment
 
-    folder = out_dir or Path(f".venv-{requirements.stem}")
+    is_name = str(requirements) == requirements.stem and not requirements.is_file()
     with errors():
-        made = make_environment(
-            requirements, folder, more=more, python=python, light=light, cuda=cuda, progress=progress
-        )
+        file = requirements_file(requirements.name) if is_name else requirements
+        folder = out_dir or Path(f".venv-{file.stem}")
+        made = make_environment(file, folder, more=more, python=python, light=light, cuda=cuda, progress=progress)
     out.print(f"ready; in a deployment file, under args:\n\nenvironment:\n  python: {made}")

@@ -14,7 +14,7 @@ GR00T = RegistryEntry(
     "vlagents_ray_models.gr00t:Gr00t",
     "GR00T N1.6 and N1.7 by NVIDIA",
     needs=("gr00t", "transformers", "torch", "diffusers"),
-    requirements=("gr00t", "lerobot06"),
+    requirements=("gr00t", "gr00t_n1d7", "lerobot06"),
     checkouts=("GR00T_SRC",),
     deployment="isaac_gr00t",
 )

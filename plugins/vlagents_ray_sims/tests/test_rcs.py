@@ -111,7 +111,7 @@ def put_assets(prefix: Path) -> None:
 
 def test_without_the_package_the_environment_to_make_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(importlib.util, "find_spec", {}.get)
-    with pytest.raises(MissingDependency, match=r"rcs/pick: rcs is not installed.*requirements/rcs.txt.*py_executable"):
+    with pytest.raises(MissingDependency, match=r"rcs/pick: rcs is not installed.*env make rcs`.*py_executable"):
         make_env("rcs/pick")
     assert "rcs is not installed" in (DuoBench.missing() or "")
 

@@ -217,7 +217,7 @@ class Calvin(SimulatorEnv):
 
     @classmethod
     def missing(cls) -> str | None:
-        cure = "run `vlagents-ray env make requirements/calvin.txt` and give the evaluation's workers that Python"
+        cure = "run `vlagents-ray env make calvin` and give the evaluation's workers that Python"
         if lacks := without(("pybullet", "hydra", "gym", "git", "quaternion"), cure):
             return lacks
         try:

@@ -341,7 +341,7 @@ class LiberoPro(Libero):
 
     suite, title = "libero_pro", "LIBERO-PRO"
     packages = (_PRO, "robosuite", "mujoco")
-    cure = "run `vlagents-ray env make requirements/libero_pro.txt` and give the evaluation's workers that Python"
+    cure = "run `vlagents-ray env make libero_pro` and give the evaluation's workers that Python"
     suites = PRO_SUITES
 
 

@@ -1,7 +1,7 @@
 """RCS, the Robot Control Stack, in MuJoCo, and DuoBench, the benchmark for two arms that is built on it.
 
-Both need a separate Python environment, requirements/rcs.txt: their packages conflict with the simulators of this
-package's extras, and RCS is AGPL-3. See docs/benchmarks/other.md.
+Both need a separate Python environment, `vlagents-ray env make rcs`: their packages conflict with the simulators of
+this package's extras, and RCS is AGPL-3. See docs/benchmarks/other.md.
 """
 
 from __future__ import annotations
@@ -117,7 +117,7 @@ def missing_packages(*packages: str) -> str | None:
     for package in packages:
         if importlib.util.find_spec(package) is None:
             return (
-                f"{package} is not installed; make an environment, `vlagents-ray env make requirements/rcs.txt`, and "
+                f"{package} is not installed; make an environment, `vlagents-ray env make rcs`, and "
                 f"have the workers run in it: runtime_env: {{py_executable: /path/to/.venv-rcs/bin/python}}"
             )
         variable, folder, further = _ASSETS[package]

@@ -210,7 +210,7 @@ class Robosuite(RobosuiteEnv):
     suite = title = "robosuite"
     known = tuple(TASKS)
     packages, distributions = ("robosuite", "mujoco"), ("robosuite", "mujoco")
-    cure = "run `vlagents-ray env make requirements/robosuite.txt` and give the evaluation's workers that Python"
+    cure = "run `vlagents-ray env make robosuite` and give the evaluation's workers that Python"
 
     def __init__(
         self,

@@ -13,10 +13,10 @@ from benchmarks.checkpoints import recipes
 from benchmarks.checkpoints.recipe import Recipe, WrittenCheckpoint
 from benchmarks.checkpoints.recipes import FAMILIES, Family, write_checkpoint
 from vlagents_ray.errors import ConfigError, MissingDependency
+from vlagents_ray.registry import requirements_file
 from vlagents_ray.serve.config.deployment import ServerArgs
 from vlagents_ray.serve.launch.deployment_file import policy_application
 
-ROOT = Path(__file__).parents[3]
 Known = Callable[..., list[Recipe]]
 
 
@@ -72,7 +72,7 @@ def test_what_is_in_a_folder_stays(tmp_path: Path, known: Known) -> None:
 
 def test_a_missing_package_names_the_environment_with_it(tmp_path: Path, known: Known) -> None:
     known("no_such_package")
-    with pytest.raises(MissingDependency, match=r"no_such_package.*requirements/hf\.txt.*benchmarks\.checkpoints own"):
+    with pytest.raises(MissingDependency, match=r"no_such_package.*env make hf .*benchmarks\.checkpoints own"):
         write_checkpoint("own", tmp_path / "made")
     assert list(tmp_path.iterdir()) == []
 
@@ -80,5 +80,5 @@ def test_a_missing_package_names_the_environment_with_it(tmp_path: Path, known: 
 @pytest.mark.parametrize("name", FAMILIES)
 def test_the_environment_of_a_family_is_one_that_can_be_made(name: str) -> None:
     family = FAMILIES[name]
-    assert (ROOT / "requirements" / f"{family.environment}.txt").is_file()
+    assert requirements_file(family.environment).is_file()
     assert (Path(recipes.__file__).parent / f"{family.module}.py").is_file()

@@ -12,6 +12,7 @@ import yaml
 from certificates import authority
 
 from vlagents_ray import ConfigError
+from vlagents_ray.registry import requirements_file
 from vlagents_ray.serve.launch.deployment_file import deployment, read_deployment
 from vlagents_ray.serve.launch.haproxy import Tls
 from vlagents_ray.serve.launch.server import running_server
@@ -70,7 +71,7 @@ def test_every_shipped_deployment_file_is_valid(file: Path, tmp_path: Path) -> N
     text = file.read_text()
     [app] = yaml.safe_load(text)["applications"]
     if (own := app["args"].get("environment", {}).get("python")) is not None:
-        assert (ROOT / "requirements" / f"{Path(own).parents[1].name.removeprefix('.venv-')}.txt").is_file()
+        assert requirements_file(Path(own).parents[1].name.removeprefix(".venv-")).is_file()
         text = text.replace(own, sys.executable)
     here = tmp_path / file.name
     here.write_text(text)

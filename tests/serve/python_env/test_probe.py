@@ -14,6 +14,7 @@ from pydantic import ValidationError
 from virtual_environments import ROOT, layered
 
 from vlagents_ray.errors import ConfigError
+from vlagents_ray.registry import requirements_file
 from vlagents_ray.serve.config.deployment import EnvironmentArgs
 from vlagents_ray.serve.launch.deployment_file import read_deployment
 from vlagents_ray.serve.python_env import probe as interpreter
@@ -103,7 +104,7 @@ def test_no_such_interpreter(tmp_path: Path) -> None:
         with pytest.raises(ConfigError) as caught:
             probe(str(tmp_path / python))
         [(requirements, folder)] = re.findall(r"`vlagents-ray env make (\S+) --out (\S+)`", str(caught.value))
-        assert (ROOT / requirements).is_file()
+        assert requirements_file(requirements).is_file()
         assert Path(folder, "bin/python") == tmp_path / python
     (tmp_path / "bin").mkdir()
     (tmp_path / "bin" / "python").symlink_to(sys.executable)

@@ -107,12 +107,12 @@ def probe(
 
 
 def _making(python: str) -> str:
-    """Return the command that creates an interpreter's environment: .venv-NAME is that of requirements/NAME.txt."""
+    """Return the command that creates an interpreter's environment: .venv-NAME is that of the family's NAME."""
     folder = Path(python).parent.parent
     prefix, _, name = folder.name.partition(".venv-")
     if prefix or not name:
         return "vlagents-ray env make REQUIREMENTS"
-    return f"vlagents-ray env make requirements/{name}.txt --out {folder}"
+    return f"vlagents-ray env make {name} --out {folder}"
 
 
 def with_process(environment: EnvironmentArgs) -> EnvironmentArgs:

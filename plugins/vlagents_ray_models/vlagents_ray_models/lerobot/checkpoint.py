@@ -110,7 +110,8 @@ def require_served(name: str, folder: Path) -> None:
             raise ConfigError(
                 f"checkpoint {folder}: LeRobot's {name!r} needs transformers with openpi's changes, which no release "
                 f"has; install the branch that LeRobot's page on {name} names into this environment, serve it with "
-                f"LeRobot 0.6.1, which does without (requirements/lerobot06.txt), by 'openpi' or, for π0, by 'pi0'"
+                f"LeRobot 0.6.1, which does without (`vlagents-ray env make lerobot06`), by 'openpi' or, for π0, by "
+                f"'pi0'"
             )
 
 

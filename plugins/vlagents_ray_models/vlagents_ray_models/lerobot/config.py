@@ -46,12 +46,12 @@ class LeRobotConfig(ModelConfig):
     )
 
 
-REQUIREMENTS = {"0.4.4": "requirements/lerobot.txt", "0.6.1": "requirements/lerobot06.txt"}
+REQUIREMENTS = {"0.4.4": "lerobot", "0.6.1": "lerobot06"}
 _REWARDS = dict.fromkeys(("reward_classifier", "sarm", "robometer", "topreward"), "it returns rewards, not actions")
 _REFUSED = {
     "0.4.4": {
         "groot": "it is GR00T N1.5, whose statistics cannot be checked in LeRobot 0.4.4; serve it with GR00T's own "
-        "code, or GR00T N1.7 with LeRobot 0.6.1 (requirements/lerobot06.txt)"
+        "code, or GR00T N1.7 with LeRobot 0.6.1 (`vlagents-ray env make lerobot06`)"
     },
     "0.6.1": {"lingbot_va": "it goes on from the frames and caches of the chunk before, which it keeps for one robot"},
 }
