@@ -170,7 +170,3 @@ def test_the_error_of_rows_is_relative_to_the_largest() -> None:
 
     want = np.array([[3.0, 4.0], [0.0, 0.0]])
     assert row_error(want + np.array([[0.0, 0.0], [0.5, 0.0]]), want) == pytest.approx(0.1)
-
-
-def test_all_files_that_are_packed_for_a_machine_without_a_network_exist() -> None:
-    assert [name for name in pack.FOLDERS if not (pack.ROOT / name).exists()] == []
