@@ -140,7 +140,7 @@ def test_lazy_layers_have_no_parameters_before_the_first_act(tmp_path: Path) -> 
 
 
 def test_a_transport_of_torchrl_is_refused() -> None:
-    with pytest.raises(ConfigError, match="got MPTransport, want ServerAddress"):
+    with pytest.raises(ConfigError, match="expected ServerAddress, got MPTransport"):
         PolicyServer(policy_factory=tiny, transport=MPTransport())
 
 
