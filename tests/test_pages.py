@@ -35,9 +35,10 @@ RUN_HERE = [(page, block) for page, block in BLOCKS if page not in TUTORIALS and
 SEEDS = {"first": 0, "a": 0, "b": 10, "machine-a": 20, "machine-b": 30} | {f"array/{n}": 100 * n for n in range(4)}
 
 # What a sentence names can mostly not be typed as it stands ("vlagents-ray serve POLICY"); of the rest, these are run,
-RUN = {"vlagents-ray doctor", "vlagents-ray policies", "vlagents-ray robot --help"}
+RUN = {"vlagents-ray policies", "vlagents-ray robot --help"}
 # and these are not.
 NOT_RUN = {
+    "vlagents-ray doctor": "tests/cli/test_doctor.py runs each check, which starts a Ray and each simulator",
     "vlagents-ray envs": "a block of docs/evaluation/index.md runs it",
     "vlagents-ray serve noop --set delta=false": "it serves until Ctrl-C; test_teleoperation.py reads such a contract",
     "vlagents-ray serve noop --port 8000": "test_served_pages.py serves so what blocks of this page need",

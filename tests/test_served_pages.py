@@ -60,7 +60,7 @@ def test_modules_of_ones_own_are_served_evaluated_and_trained_from_their_folder(
     with serving("own_policy:Servo", log, None, "--set", "camera_turn=120", cwd=folder) as host:
         said = log.read_text()
         url = f"http://{host}"
-        evaluation = f"vlagents-ray eval own_env:CraneEnv --policy {url} --episodes 2 --workers 2 --out runs/own"
+        evaluation = f"vlagents-ray eval own_env:CraneEnv --policy {url} --episodes 2 --workers 1 --out runs/own"
         training = f"HOME={Path.home()} python rl_loop.py {url} >learned"  # Ray's token is there
         run(Block("bash", 1, f"{evaluation}\n{training}"), folder, host)
         learned = re.findall(r"^servo@\d+: (\d+)%", (folder / "learned").read_text(), re.MULTILINE)

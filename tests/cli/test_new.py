@@ -111,10 +111,8 @@ def test_a_skeleton_of_a_policy_is_served_and_one_of_an_environment_evaluated(fo
         obs = Obs({"front": np.zeros((96, 96, 3), np.uint8)}, state={"xyzrpy": np.ones(6, np.float32)})
         agent.reset(obs, "lift the cup")
         assert agent.act(obs).action.shape == (4,)
-        run(
-            Block("bash", 1, f"vlagents-ray eval tabletop --policy http://{host} --episodes 2 --out runs/policy"),
-            folder,
-        )
+        words = f"tabletop --policy http://{host} --episodes 2 --workers 0 --out runs/policy"
+        run(Block("bash", 1, f"vlagents-ray eval {words}"), folder)
     run(Block("bash", 1, "vlagents-ray eval my_env.yaml --video none"), folder)
     assert (folder / "runs" / "my_env" / "results.db").is_file()
 

@@ -125,9 +125,11 @@ def _block(language: str, above: list[tuple[int, str]], code: list[tuple[int, st
 
 
 def checkout(folder: Path) -> None:
-    """Put into `folder` what pages name as paths in a checkout."""
+    """Put into `folder` what pages name as paths in a checkout, with two episodes of each env in `evaluations`."""
     for name in ("cluster", "deployments", "evaluations", "examples", "reference"):
         shutil.copytree(ROOT / name, folder / name)
+    for file in (folder / "evaluations").glob("*.yaml"):
+        file.write_text(re.sub(r"\bepisodes: \d+", "episodes: 2", file.read_text()))
 
 
 def run(block: Block, cwd: Path, host: str = DOCUMENTED_HOST, *, page: str = "README") -> None:
