@@ -9,11 +9,13 @@ import threading
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
+from typing import Any
 
 import pytest
 from eval_fakes import wait_for
 
 import vlagents_ray
+from vlagents_ray import registry
 from vlagents_ray.cli import ray_session
 from vlagents_ray.cli.ray_session import quiet_ray
 from vlagents_ray.cli.serve import connection_lines
@@ -21,7 +23,7 @@ from vlagents_ray.errors import ConfigError
 from vlagents_ray.registry import POLICIES, names, policy_class
 from vlagents_ray.serve.launch import deployment_file
 from vlagents_ray.serve.launch.deployment_file import deployment, own_settings, read_deployment, with_gateways_at
-from vlagents_ray.serve.ports import EVERYWHERE
+from vlagents_ray.serve.ports import EVERYWHERE, LOOPBACK
 from vlagents_ray.yaml_text import read_yaml
 
 INFO = "INFO 2026-11-21 17:02:51,406 proxy 127.0.0.1 -- HAProxy starting on node 321f (HTTP port: 8977)."
@@ -163,6 +165,18 @@ def test_a_server_says_its_policy_its_page_and_where_each_kind_of_client_connect
         "  openpi: wss://127.0.0.1:8000/, wss://127.0.0.1:8000/openpi",
         "  vlagents: rpyc://0.0.0.0:8080",
     ]
+
+
+def test_a_server_names_the_pages_of_the_parts_that_are_on(monkeypatch: pytest.MonkeyPatch) -> None:
+    def pages(**settings: Any) -> list[str]:
+        lines = connection_lines(deployment("noop", **settings), {"noop": "http://127.0.0.1:8000"}, LOOPBACK)
+        return [line for line in lines if "page" in line]
+
+    assert pages() == ["  live page: http://127.0.0.1:8000/live"]
+    assert pages(parts={"live": None}) == []
+    assert pages(access={"insecure": True}) == [], "it would show nothing"
+    monkeypatch.setattr(registry, "_entry_points", lambda _: {})
+    assert pages() == [], "the plug-in is not installed"
 
 
 def test_the_page_of_a_server_with_keys_is_asked_for_with_one(tmp_path: Path) -> None:
