@@ -3,14 +3,32 @@
 from __future__ import annotations
 
 import contextlib
+import socket
 import threading
+import time
 from collections.abc import Iterator
 from dataclasses import dataclass
 
 import pytest
+from dialect_server import image
 from eval_fakes import wait_for
-from leaving_clients import ACTED, BOUND_S, CLIENTS, GATEWAYS, HELD, OTHERS, LeavingClient, StoppableServer, seconds_of
+from leaving_clients import (
+    ACTED,
+    BOUND_S,
+    CLIENTS,
+    GATEWAYS,
+    HELD,
+    LARGE,
+    OTHERS,
+    LeavingClient,
+    StoppableServer,
+    seconds_of,
+)
 
+from vlagents_ray.client.credentials import Credentials
+from vlagents_ray.client.transports.shm import ShmTransport
+from vlagents_ray.interface import Obs
+from vlagents_ray.protocol.messages import Request
 from vlagents_ray.registry import dialect_class, names
 from vlagents_ray.serve.dialects.base import RouteDialect
 
@@ -75,6 +93,50 @@ def test_a_server_that_stops_leaves_no_client_waiting(name: str, situation: str)
         elif situation == "half a message":
             assert at.client.end() == "unavailable"
         assert seconds_of(lambda: stopping.join(BOUND_S)) < BOUND_S
+
+
+@pytest.mark.parametrize("sends_more", [False, True], ids=["only reads", "sends half a message"])
+@pytest.mark.parametrize("name", ["own port", "GR00T", "vlagents"])  # LeRobot's clients take 4 MB: test_http2_front.py
+def test_an_answer_that_is_written_before_a_stop_arrives_at_a_slow_client(name: str, sends_more: bool) -> None:
+    """Also if the client has sent what is never read, for which the kernel resets a connection that is closed."""
+    with contextlib.ExitStack() as stack:
+        server = StoppableServer(stack)
+        relay = server.relay(name)
+        client = CLIENTS[name](server)
+        relay.gate.clear()
+        client.send(LARGE)
+        assert relay.is_holding.wait(BOUND_S)
+        if sends_more and name != "GR00T":  # whose client cannot, before it has an answer
+            client.send_half()
+        stopping = threading.Thread(target=server.stop)
+        stopping.start()
+        wait_for(lambda: not server.is_listening(), BOUND_S)
+        relay.gate.set()
+        assert client.answer() == ACTED
+        if client.closes_with_code:
+            assert client.end() == "1012 the replica is stopping; connect again"
+        assert seconds_of(lambda: stopping.join(BOUND_S)) < BOUND_S
+
+
+def test_an_answer_over_shared_memory_arrives_though_a_later_message_is_never_read() -> None:
+    with contextlib.ExitStack() as stack:
+        server = StoppableServer(stack)
+        transport = ShmTransport(server.near.address, Credentials(""))
+        transport.connect(BOUND_S)
+        stack.callback(transport.close)
+        transport.call([Request("reset", Obs({"front": image(2)}), request_id="0")], BOUND_S)
+        connection = transport._socket
+        assert connection is not None
+        deadline = time.monotonic() + BOUND_S
+        acts = [Request("act", Obs({"front": image(2)}), request_id="1")]
+        transport._send(connection, acts, deadline)
+        connection.setblocking(True)
+        connection.recv(1, socket.MSG_PEEK)  # the answer is written
+        server.engine.close()
+        connection.send(b"x")
+        server.near.close()
+        [reply] = transport._await(connection, acts, deadline)
+        assert reply.error is None
 
 
 @pytest.mark.parametrize(("name", "situation"), EACH)

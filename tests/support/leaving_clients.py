@@ -12,6 +12,7 @@ import threading
 import time
 from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import replace
 from functools import partial
 from types import SimpleNamespace
 from typing import Any
@@ -56,11 +57,15 @@ from vlagents_ray.serve.ports import free_port, reserve
 from vlagents_ray_dialects.messages import vla_eval as vla_eval_codec
 
 BOUND_S = 5.0  # nothing waits for longer
+LARGE = 240  # for a picture of this brightness the policy returns 8 MB, more than the kernel's buffers hold
 HELD = 250  # the policy acts on pictures from this brightness on when its gate opens
 OTHERS = ("another", "a third")  # sessions of other clients
 SLOW_S = 0.02  # of each act, so that another thread reads the connections while the policy acts
 ACTED = "acted"
 LIMITS = Limits(body_bytes=2**20)
+
+
+_LARGE_ACTION = np.random.default_rng(0).random(2**21, np.float32)  # which no protocol can compress
 
 
 class Acts(list[int]):
@@ -88,7 +93,42 @@ class GatedPolicy(Agent):
             self.gate.wait(BOUND_S)
         time.sleep(SLOW_S)
         self.acted.append(brightness)
-        return Act(np.zeros(8, np.float32))
+        return Act(_LARGE_ACTION if brightness == LARGE else np.zeros(8, np.float32))
+
+
+class SlowRelay:
+    """Forwards one connection to a port; answers stay unread while the `gate` is closed."""
+
+    def __init__(self, target: int, stack: contextlib.ExitStack) -> None:
+        self.gate = threading.Event()
+        self.gate.set()
+        self.is_holding = threading.Event()  # whether an answer has arrived at the closed gate
+        self._target = target
+        self._listener = stack.enter_context(socket.create_server(("127.0.0.1", 0)))
+        self.port = self._listener.getsockname()[1]
+        threading.Thread(target=self._run, daemon=True).start()
+
+    def _run(self) -> None:
+        client, _ = self._listener.accept()
+        with client, socket.create_connection(("127.0.0.1", self._target)) as server:
+            requests = threading.Thread(target=self._forward, args=(client, server), daemon=True)
+            requests.start()
+            with contextlib.suppress(OSError):
+                while data := server.recv(65536):
+                    if not self.gate.is_set():
+                        self.is_holding.set()
+                        self.gate.wait(BOUND_S)
+                    client.sendall(data)
+            with contextlib.suppress(OSError):
+                client.shutdown(socket.SHUT_RDWR)
+            requests.join()
+
+    @staticmethod
+    def _forward(client: socket.socket, server: socket.socket) -> None:
+        with contextlib.suppress(OSError):
+            while data := client.recv(65536):
+                server.sendall(data)
+            server.shutdown(socket.SHUT_WR)
 
 
 class StoppableServer:
@@ -162,6 +202,20 @@ class StoppableServer:
                 endpoint.close()
             for closed in closing:
                 closed.result()
+
+    def relay(self, name: str) -> SlowRelay:
+        """Put a relay before the own port of the replica or of a dialect, for later clients."""
+        port = self.own.address.port if name == "own port" else self.ports[name.lower()]
+        relay = SlowRelay(port, self.stack)
+        if name == "own port":
+            self.own.address = replace(self.own.address, port=relay.port)
+        else:
+            self.ports[name.lower()] = relay.port
+        return relay
+
+    def is_listening(self) -> bool:
+        """Whether the own port of the replica or of a dialect accepts connections."""
+        return self.own._listener.fileno() >= 0 or any(dialect.alive() for dialect in self.gateways.values())
 
     def _as_in_serve(self, app: ASGIApp) -> ASGIApp:
         """Count the requests that are under way; cancel one of HTTP when its client leaves, as Serve does."""
@@ -260,7 +314,9 @@ class WebSocketClient(LeavingClient):
         if path == "own":
             port, path = server.own.address.port, server.own.address.path
         url = f"ws://127.0.0.1:{port}{path}"
-        self._socket = server.stack.enter_context(connect(url, compression=None, ping_interval=None, close_timeout=0.1))
+        self._socket = server.stack.enter_context(
+            connect(url, compression=None, ping_interval=None, close_timeout=0.1, max_size=None)
+        )
         if greets:
             self._socket.recv(BOUND_S)
         if opening:

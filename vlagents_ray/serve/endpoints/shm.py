@@ -218,6 +218,11 @@ class UnixConnection(PolledConnection):
 
     def _discard(self) -> None:
         self._payload.free()
+        # With messages unread, the kernel would report a reset to the client before the answers that it has not read.
+        with contextlib.suppress(OSError):
+            self._connection.shutdown(socket.SHUT_RD)
+            while self._connection.recv(1):
+                pass
 
     def _write(self, message: Message) -> None:
         try:
