@@ -46,6 +46,7 @@ NOT_RUN = {
     "vlagents-ray robot --env tabletop --leader keyboard": "tests/cli/test_robot.py types its keys",
     "vlagents-ray serve my_policies:Reach --set gain=0.3": "test_served_pages.py serves examples/own_policy.py so",
     "vlagents-ray env make hf --out .venv-hf": "it downloads packages",
+    "vlagents-ray env make rcs": "it downloads packages",
 }
 
 
