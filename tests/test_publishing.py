@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import re
 import shutil
 import subprocess
@@ -88,6 +89,15 @@ def test_a_changed_requirement_or_torch_makes_the_table_old(monkeypatch: pytest.
         assert resolved.digest() != before
     monkeypatch.setitem(resolved.EXTRAS, "record", ["av>=13"])
     assert resolved.digest() != before
+
+
+def test_the_digest_of_the_table_is_the_same_in_each_process() -> None:
+    command = [sys.executable, "-c", "import resolved; print(resolved.digest())"]
+    digests = set()
+    for seed in range(4):  # by which Python orders sets of texts
+        env = {**os.environ, "PYTHONHASHSEED": str(seed), "PYTHONPATH": str(Path(resolved.__file__).parent)}
+        digests.add(subprocess.run(command, env=env, capture_output=True, text=True, check=True).stdout)
+    assert len(digests) == 1
 
 
 def test_the_requirements_of_an_extra_are_those_of_the_extras_that_it_names_too() -> None:

@@ -50,7 +50,11 @@ def direct(extra: str | None) -> list[str]:
     found = list(PROJECT["dependencies"]) if extra is None else direct(None)
     for text in EXTRAS[extra] if extra else []:
         wanted = Requirement(text)
-        found += [one for name in wanted.extras for one in direct(name)] if wanted.name == PROJECT["name"] else [text]
+        if wanted.name != PROJECT["name"]:
+            found.append(text)
+            continue
+        for name in sorted(wanted.extras):  # a set, whose order differs between processes
+            found += direct(name)
     return list(dict.fromkeys(found))
 
 
