@@ -188,8 +188,8 @@ class ForwardedConnection:
         try:
             while data := self._server.recv(_READ_BYTES):
                 self._client.sendall(data)
-            wait_delivered(self._client, time.monotonic() + ANSWERS_S)
-        except OSError as error:
+        except OSError as error:  # a server that ends with unread requests resets the connection after its answers
             logger.info("%s: disconnected a client: %s", self._front.name, error)
         finally:
+            wait_delivered(self._client, time.monotonic() + ANSWERS_S)
             self.end()
