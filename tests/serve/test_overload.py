@@ -743,12 +743,12 @@ def test_a_key_over_its_rate_is_read_on_none_of_its_connections(replica: KeyedRe
     first.close(), second.close()
 
 
-@pytest.mark.parametrize("path", ["own", "/v1/stream", "/openpi", "/roboarena", "/vla-eval"])
+@pytest.mark.parametrize("path", ["own", "/v1/stream"])
 def test_the_messages_of_a_key_over_its_rate_stay_unread(
     replica: KeyedReplica, monkeypatch: pytest.MonkeyPatch, path: str
 ) -> None:
     """Reading them would take time from robots, and memory until they are refused."""
-    monkeypatch.setattr(api_keys, "_THROTTLED_S", (5.0, 5.0))
+    monkeypatch.setattr(api_keys, "_THROTTLED_S", (3.0, 3.0))
     visitor = replica.visitor("right")
     client = _keyed_stream(replica, visitor.token, path)
     replica.known.change(visitor.name, rate=1e-6)
@@ -758,6 +758,7 @@ def test_the_messages_of_a_key_over_its_rate_stay_unread(
         caller.admit()
     assert _part(client, STREAM_BYTES) > STREAM_BYTES / 4, "the kernel's buffers hold 10 MB"
     client.close()
+    wait_for(lambda: visitor.name not in replica.known.keys._held)  # what they hold is read, which takes memory
 
 
 def test_an_act_in_compact_form_is_read_again_after_a_refusal(replica: KeyedReplica) -> None:
