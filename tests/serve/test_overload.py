@@ -743,14 +743,13 @@ def test_a_key_over_its_rate_is_read_on_none_of_its_connections(replica: KeyedRe
     first.close(), second.close()
 
 
-@pytest.mark.parametrize("path", ["own", "/v1/stream"])
-def test_the_messages_of_a_key_over_its_rate_stay_unread(
-    replica: KeyedReplica, monkeypatch: pytest.MonkeyPatch, path: str
+def test_the_messages_of_a_key_over_its_rate_stay_unread_at_uvicorns_websockets(
+    replica: KeyedReplica, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Reading them would take time from robots, and memory until they are refused."""
     monkeypatch.setattr(api_keys, "_THROTTLED_S", (3.0, 3.0))
     visitor = replica.visitor("right")
-    client = _keyed_stream(replica, visitor.token, path)
+    client = _keyed_stream(replica, visitor.token, "/v1/stream")
     replica.known.change(visitor.name, rate=1e-6)
     caller = replica.known.keys.check(visitor.token, "app")
     caller.admit()
