@@ -176,7 +176,7 @@ class KeyedReplica:
         inside = build_http_app(self.engine, lambda: METADATA, LIMITS, more=[*routes, *others])
         self.routes = inside.routes
         with_access = AccessMiddleware(
-            inside, self.known.keys, "app", admission=self.engine.admission, public=parts.pages()
+            inside, self.known.keys, "app", admission=self.engine.admission, public=parts.pages(inside.routes)
         )
         self.port = stack.enter_context(served(FrontMiddleware(with_access)))
         check = partial(self.at_gateway.check, app="app")

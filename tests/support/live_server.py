@@ -123,7 +123,7 @@ def live_server(
     with ExitStack() as stack:
         stack.callback(parts.close)
         stack.callback(engine.close)
-        port = stack.enter_context(served(AccessMiddleware(inside, keys, "app", public=parts.pages())))
+        port = stack.enter_context(served(AccessMiddleware(inside, keys, "app", public=parts.pages(inside.routes))))
         yield LiveServer(engine, live.view, live.fleet, port)
 
 

@@ -10,15 +10,18 @@ from typing import Any, ClassVar
 
 import pytest
 from pydantic import ValidationError
-from starlette.responses import PlainTextResponse
-from starlette.routing import Route
+from starlette.requests import Request
+from starlette.responses import PlainTextResponse, Response
+from starlette.routing import BaseRoute, Route
 
 from vlagents_ray import registry
 from vlagents_ray.errors import ConfigError, InvalidInput
 from vlagents_ray.policies.noop import Noop
+from vlagents_ray.protocol.messages import Limits
 from vlagents_ray.registry import RegistryEntry
 from vlagents_ray.serve.config.deployment import ServerArgs
 from vlagents_ray.serve.config.parts import PartArgs, PartConfig
+from vlagents_ray.serve.endpoints.http import build_http_app
 from vlagents_ray.serve.engine.engine import Engine
 from vlagents_ray.serve.engine.observer import Observer
 from vlagents_ray.serve.replica.part import OtherReplica, PartContext, ReplicaPart, ReplicaParts, open_parts
@@ -227,3 +230,31 @@ def test_other_replicas_call_only_the_methods_that_a_part_names(context: PartCon
     for method in ("secret", "close", "open", "__init__", "siblings"):
         with pytest.raises(LookupError, match=f"no method '{method}'"):
             asyncio.run(parts.call(f"{HERE}:Totals", method))
+
+
+class OfEverybody(Counter):
+    """Has one page, by the path in its settings."""
+
+    def routes(self) -> list[BaseRoute]:
+        return [Route("/count", answer), Route("/v1/metadata", answer), Route("/files/{name}", answer)]
+
+
+def answer(request: Request) -> Response:
+    return PlainTextResponse("here")
+
+
+@pytest.mark.parametrize(
+    ("path", "is_own"), [("/count", True), ("/v1/metadata", False), ("/v1/act", False), ("/no", False)]
+)
+def test_only_a_parts_own_route_is_a_page_without_a_key(
+    path: str, is_own: bool, context: PartContext, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(OfEverybody, "pages", {"page": path})
+    parts = open_parts(args(OfEverybody={}), context)
+    app = build_http_app(Engine(Noop()), dict, Limits(), more=list(parts.routes()))
+    if is_own:
+        assert parts.pages(app.routes) == {path}
+    else:
+        with pytest.raises(ConfigError, match=f"expected pages that are routes of its own, got '{path}'"):
+            parts.pages(app.routes)
+    parts.close()

@@ -36,8 +36,9 @@ from contextlib import ExitStack
 from dataclasses import dataclass, field, replace
 from typing import Any, ClassVar, Protocol
 
-from starlette.routing import BaseRoute
+from starlette.routing import BaseRoute, Match
 
+from vlagents_ray.errors import ConfigError
 from vlagents_ray.registry import registered_class
 from vlagents_ray.serve.config.parts import PartArgs, PartConfig
 from vlagents_ray.serve.engine.engine import Engine
@@ -119,7 +120,8 @@ class ReplicaPart:
 
     pages: ClassVar[Mapping[str, str]] = {}
     """Paths of pages for a browser, by title, such as {"live page": "/live"}; `vlagents-ray serve` prints their
-    addresses. They need no key, which a browser cannot send with them: a page itself must hold no data."""
+    addresses. They need no key, which a browser cannot send with them: a page itself must hold no data. Each is a route
+    of the part; the replica does not start otherwise."""
 
     def __init__(self, settings: Any, context: PartContext) -> None:
         """Create a part with the `settings` of the deployment file, an instance of its `Config`."""
@@ -155,16 +157,33 @@ class ReplicaParts:
 
     def __init__(self, parts: Mapping[str, ReplicaPart], opened: ExitStack) -> None:
         self._parts = dict(parts)
+        self._routes = {name: list(part.routes()) for name, part in parts.items()}
         self._opened = opened
 
     def routes(self) -> Iterator[BaseRoute]:
         """Yield the routes of all parts."""
-        for part in self._parts.values():
-            yield from part.routes()
+        for routes in self._routes.values():
+            yield from routes
 
-    def pages(self) -> frozenset[str]:
-        """Return the paths of the pages of all parts."""
-        return frozenset(path for part in self._parts.values() for path in part.pages.values())
+    def pages(self, server: Sequence[BaseRoute]) -> frozenset[str]:
+        """Return the paths of the pages of all parts, which need no key.
+
+        Args:
+            server: All routes of the server, in the order in which they are tried.
+
+        Raises:
+            ConfigError: A request for a page would be answered by a route that is not the part's own, which would need
+                no key either.
+        """
+        paths = set()
+        for name, part in self._parts.items():
+            for path in part.pages.values():
+                if _route_of(path, server) not in self._routes[name]:
+                    raise ConfigError(
+                        f"part {name!r}: expected pages that are routes of its own, got {path!r}; correct its `pages`"
+                    )
+                paths.add(path)
+        return frozenset(paths)
 
     def describe(self) -> dict[str, Any]:
         """Return the facts of the parts that have some, by name.
@@ -199,6 +218,16 @@ class ReplicaParts:
     def close(self) -> None:
         """Close all parts in reverse order."""
         self._opened.close()
+
+
+def _route_of(path: str, routes: Sequence[BaseRoute]) -> BaseRoute | None:
+    """Return the route that answers `GET path`, or None."""
+    scope = {"type": "http", "method": "GET", "path": path, "root_path": "", "headers": []}
+    for route in routes:
+        match, _ = route.matches(scope)
+        if match is Match.FULL:
+            return route
+    return None
 
 
 def open_parts(args: PartArgs, context: PartContext) -> ReplicaParts:

@@ -222,7 +222,7 @@ class PolicyReplica(ClientApi, SiblingApi):
             hosts=hosts,
             admission=self._engine.admission,
             shutdown=self._shutdown,
-            public=self._parts.pages(),
+            public=self._parts.pages(inside.routes),
         )
 
     def metadata(self) -> dict[str, Any]:
