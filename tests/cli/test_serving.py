@@ -72,6 +72,19 @@ def test_only_problems_and_what_a_policy_prints_are_shown_and_the_rest_is_in_the
     assert file.read_text().splitlines() == expected
 
 
+def test_after_an_interrupt_what_serves_actors_print_goes_to_the_log_and_what_a_policy_prints_is_shown(
+    ray: Processes, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A signal to the whole process group also ends HAProxy, and Serve's actors print tracebacks of its crash."""
+    monkeypatch.setattr("vlagents_ray.cli.ray_session.is_interrupted", lambda: True)
+    crash = "RuntimeError: Failed to update and reload HAProxy"
+    with quiet_ray("serve") as file:
+        for pid, actor in enumerate(("HAProxyManager", "ProxyActor", "ServeController", "ServeReplica:noop:Policy")):
+            ray.say(f":actor_name:{actor}", crash, pid=pid)
+        wait_for(lambda: file is not None and file.read_text().count(crash) == 3)
+    assert capsys.readouterr().err.splitlines() == [f"(ServeReplica:noop:Policy pid=3) {crash}"]
+
+
 def test_a_line_is_read_when_it_is_complete_and_a_rotated_file_from_its_beginning(
     ray: Processes, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -34,6 +34,7 @@ _FILE_BYTES = 10_000_000  # Serve logs each request; twice as much is kept
 _FOLLOW_S = 0.3  # period at which the log files of Ray's processes are read
 _LOG_FILES = ("worker-*.out", "worker-*.err", "raylet*.err")  # names in the folder of Ray's logs
 _DAEMON = "raylet"
+_OF_SERVE = ("HAProxyManager", "ProxyActor", "ServeController")  # Serve's own actors
 _ACTOR = ":actor_name:"  # begins the line that names the actor of the file
 _TITLES = (_ACTOR, ":task_name:", ":job_id:")
 _LOAD_FAILURES = ("Exception in Replica(", "Failed to update the deployments", "the policy did not load")
@@ -114,9 +115,10 @@ class _Terminal:
         elif _SERVES_LINE.match(line):
             self.failing.discard(process)
         starting = self._started is not None and not self._started.is_set()
-        # A signal to the whole process group also ends Ray's daemon, which then guesses at causes.
-        guessed = process == _DAEMON and is_interrupted()
-        if guessed or (starting and process in self.failing) or not _is_problem(line, level):
+        # A signal to the whole process group also ends Ray's daemon, which then guesses at
+        # causes, and HAProxy, of which Serve's actors then print that it crashed.
+        is_consequence = is_interrupted() and (process == _DAEMON or actor in _OF_SERVE)
+        if is_consequence or (starting and process in self.failing) or not _is_problem(line, level):
             self._note(text)
         else:
             sys.stderr.write(f"{text}\n")
