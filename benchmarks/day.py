@@ -41,7 +41,7 @@ from vlagents_ray.client.commands import COMMAND, CommandInbox
 from vlagents_ray.contract import ActionSpec, Contract
 from vlagents_ray.errors import ConnectionLost, DeadlineExceeded, PolicyFailed, PolicyUnavailable, VLAgentsError
 from vlagents_ray.interface import CAPTURED, Act, Agent, Obs
-from vlagents_ray.robot import Guard, Limits, Watchdog, loop, run_loop, safety
+from vlagents_ray.robot import Guard, Limits, Watchdog, loop, run_loop, watchdog
 from vlagents_ray.robot.simulated import SimulatedRobot
 
 HZ = 50.0
@@ -397,7 +397,7 @@ def simulated_time(world: World) -> Iterator[None]:
             return 0.0
 
     with contextlib.ExitStack() as stack:
-        for module in (loop, player, buffer, safety):
+        for module in (loop, player, buffer, watchdog):
             stack.enter_context(mock.patch.object(module, "time", world.clock))
         stack.enter_context(mock.patch.object(loop, "Pacer", Pacer))
         stack.enter_context(mock.patch.object(loop, "undisturbed", return_value=contextlib.nullcontext([])))

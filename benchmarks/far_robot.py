@@ -20,9 +20,10 @@ from vlagents_ray.chunking.player import ChunkPlayer, PlayerSettings
 from vlagents_ray.client.agent import RemoteAgent
 from vlagents_ray.contract import ActionSpec, CameraSpec, Contract, StateSpec
 from vlagents_ray.interface import DELAY, LEFTOVER, SAFE, Act, Agent, Obs
+from vlagents_ray.robot.guard import Guard
 from vlagents_ray.robot.loop import run_loop
-from vlagents_ray.robot.safety import Guard, Watchdog
 from vlagents_ray.robot.simulated import SimulatedRobot
+from vlagents_ray.robot.watchdog import Watchdog
 from vlagents_ray.serve.python_env.child_start import die_with_parent, own_stdout
 
 HZ = 30.0

@@ -15,8 +15,8 @@ from vlagents_ray.contract import ActionSpec, Contract
 from vlagents_ray.interface import Act, Agent, Obs
 from vlagents_ray.robot.loop import run_loop
 from vlagents_ray.robot.record import Recorder
-from vlagents_ray.robot.safety import Watchdog
 from vlagents_ray.robot.simulated import SimulatedRobot
+from vlagents_ray.robot.watchdog import Watchdog
 
 
 class Arm:

@@ -31,6 +31,7 @@ from vlagents_ray.interface import Agent
 from vlagents_ray.naming import did_you_mean
 from vlagents_ray.registry import entries, names, not_installed, pip_install, registered_function
 from vlagents_ray.robot.fit import Fit, Trained
+from vlagents_ray.robot.guard import SOFT_START_S, Guard, measured_state
 from vlagents_ray.robot.leaders import leader_named
 from vlagents_ray.robot.limits import Limits
 from vlagents_ray.robot.loop import (
@@ -44,9 +45,9 @@ from vlagents_ray.robot.loop import (
     run_loop,
 )
 from vlagents_ray.robot.record import Recorder
-from vlagents_ray.robot.safety import SOFT_START_S, Guard, Watchdog, measured_state
 from vlagents_ray.robot.simulated import SimulatedRobot
 from vlagents_ray.robot.terminal import typed_keys
+from vlagents_ray.robot.watchdog import Watchdog
 from vlagents_ray.viewers import open_viewer
 
 logger = logging.getLogger(__name__)

@@ -27,10 +27,11 @@ from vlagents_ray.interface import CAPTURED, CAUSE, INTERVENTION, PLANNED, SAFE,
 from vlagents_ray.naming import did_you_mean
 from vlagents_ray.registry import names, not_installed, registered_class
 from vlagents_ray.robot.fit import Fit, Trained
+from vlagents_ray.robot.guard import Guard
 from vlagents_ray.robot.limits import Limits
 from vlagents_ray.robot.pacing import KEPT_TICKS, Pacer, jitter, undisturbed
 from vlagents_ray.robot.record import Recorder
-from vlagents_ray.robot.safety import Guard, Watchdog
+from vlagents_ray.robot.watchdog import Watchdog
 from vlagents_ray.settings import require_arguments
 from vlagents_ray.viewers import EpisodeViewer, LoopView
 

@@ -30,10 +30,10 @@ from vlagents_ray.interface import Act, Agent, Obs
 from vlagents_ray.naming import plain
 from vlagents_ray.robot import Guard, LoopReport, run_loop
 from vlagents_ray.robot.fit import Trained
+from vlagents_ray.robot.guard import measured_state
 from vlagents_ray.robot.limits import Limits
 from vlagents_ray.robot.loop import fit_of, robot_watchdog
 from vlagents_ray.robot.record import Recorder
-from vlagents_ray.robot.safety import measured_state
 from vlagents_ray.robot.wrapper import RobotWrapper
 
 _STOPPED = "stopped by the operator"

@@ -25,8 +25,8 @@ from vlagents_ray import Act, ActionSpec, Agent, CameraSpec, ChunkPlayer, Contra
 from vlagents_ray.contract import require_match
 from vlagents_ray.errors import ConfigError, ContractMismatch, InvalidAction
 from vlagents_ray.robot import Guard, Watchdog, run_loop
+from vlagents_ray.robot.guard import measured_state
 from vlagents_ray.robot.loop import LoopReport
-from vlagents_ray.robot.safety import measured_state
 from vlagents_ray_robot.check import examine
 from vlagents_ray_robot.ros import RosRobot
 from vlagents_ray_robot.ros.robot import settings_from

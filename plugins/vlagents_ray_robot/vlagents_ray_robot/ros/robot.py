@@ -18,7 +18,7 @@ from vlagents_ray.chunking.buffer import SKEW_S, CaptureClock
 from vlagents_ray.contract import ActionSpec, CameraSpec, Contract, StateSpec
 from vlagents_ray.errors import ConfigError, InvalidAction, VLAgentsError
 from vlagents_ray.interface import CAPTURED, Obs
-from vlagents_ray.robot.safety import Watchdog
+from vlagents_ray.robot.watchdog import Watchdog
 from vlagents_ray.settings import require_arguments
 from vlagents_ray.yaml_text import load_yaml
 from vlagents_ray_robot import DISTRIBUTION

@@ -32,7 +32,7 @@ from trajectory_msgs.msg import JointTrajectory
 from vlagents_ray import Act, ActionSpec, Agent, CameraSpec, ChunkPlayer, Contract, Obs, StateSpec
 from vlagents_ray.errors import ConfigError
 from vlagents_ray.robot import Guard, Watchdog, run_loop
-from vlagents_ray.robot.safety import measured_state
+from vlagents_ray.robot.guard import measured_state
 from vlagents_ray_robot.ros import RosRobot
 from vlagents_ray_robot.ros.links import Ros2
 from vlagents_ray_robot.ros.robot import settings_from

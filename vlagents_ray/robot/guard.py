@@ -1,17 +1,14 @@
-"""Checks between a policy and a robot: a guard for each action, and a watchdog for silence."""
+"""The guard: the check of every action before it reaches a robot."""
 
 from __future__ import annotations
 
 import functools
 import math
-import threading
-import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 
 import numpy as np
 
-from vlagents_ray.chunking.control import Control
 from vlagents_ray.chunking.ease import EaseIn
 from vlagents_ray.contract import ActionSpec, Contract
 from vlagents_ray.errors import ConfigError, InvalidAction, MissingState
@@ -378,146 +375,3 @@ def _bounds(name: str, stricter: np.ufunc, *given: float | np.ndarray | tuple[fl
 def _tolerant(limit: float | np.ndarray, dim: int) -> list[float]:
     """Return the limit of each number, with a tolerance, as float32 rounds a step of 0.1 to slightly more."""
     return (np.broadcast_to(limit, dim) * (1 + 1e-4) + 1e-6).tolist()  # type: ignore[no-any-return]
-
-
-class Watchdog:
-    """A thread that stops the robot when a source, such as the server or the control loop, is silent for too long.
-
-        Watchdog(robot.stop, {"server": 1.0, "loop": 0.2})  # s
-
-    `stop` is called once for each silence, on the watchdog's own thread, which also detects a control loop that hangs.
-    The time limits begin to run at `start` (or `with`). After a stop, `control.stopped` is true until `restart` is
-    called, also in later runs of the control loop. If `stop` raises an exception, it is kept in `error`, and the
-    watchdog continues.
-
-    Args:
-        stop: Stops the robot; its argument is the reason as text, which is also appended to `barks`.
-        silent_s: The longest silence of each source by name, s.
-
-    Raises:
-        ConfigError: A time limit is not above 0.
-    """
-
-    def __init__(self, stop: Callable[[str], None], silent_s: Mapping[str, float]) -> None:
-        for name, limit_s in silent_s.items():
-            if not limit_s > 0:
-                raise ConfigError(f"watchdog: got {limit_s} s for {name!r}, want above 0")
-        self.barks: list[str] = []  # the reasons given to `stop`
-        self.error: Exception | None = None
-        self.control = Control()
-        """The state of the robot, which `run_loop` lets it share with a chunk player."""
-        self._stop = stop
-        self._limits = dict(silent_s)
-        self._heard = dict.fromkeys(silent_s, 0.0)
-        self._changed = threading.Condition()  # reentrant
-        self._thread: threading.Thread | None = None
-
-    def heard(self, name: str, ago_s: float = 0.0) -> None:
-        """Record a sign of life of a source.
-
-        Args:
-            name: The source; a name that is not watched is ignored.
-            ago_s: The age of the sign, s.
-
-        Raises:
-            ConfigError: `ago_s` is negative or not finite.
-        """
-        if not 0 <= ago_s < math.inf:
-            raise ConfigError(f"heard: got {ago_s} s ago for {name!r}, want a finite number from 0")
-        at = time.monotonic() - ago_s
-        heard = self._heard.get(name)
-        if heard is None or at <= heard:
-            return
-        with self._changed:
-            self._heard[name] = at
-            if name in self.control.silent and ago_s < self._limits[name]:
-                self.control.heard(name)
-                self._changed.notify_all()
-
-    def share(self, control: Control) -> None:
-        """Use the state of a chunk player, to which earlier stops are moved."""
-        with self._changed:
-            if control is not self.control:
-                control.adopt(self.control)
-                self.control = control
-
-    def trip(self, reason: str) -> None:
-        """Stop the robot now, on the caller's thread; only `restart` allows motion again."""
-        with self._changed:
-            self.control.stop(reason)
-        self.barks.append(reason)
-        with self.control.stopping():
-            self._stop(reason)
-
-    def restart(self) -> bool:
-        """Allow motion again after a stop; may be called from any thread and from a signal handler.
-
-        Returns:
-            Whether motion is allowed. While a source is silent (`control.silent`), it is not: call this again later.
-        """
-        with self._changed:
-            return self.control.restart()
-
-    def start(self) -> None:
-        """Start the thread and the time limits of all sources, unless they run. Stops and silences persist."""
-        with self._changed:
-            if self._thread is not None:
-                return
-            self._heard = dict.fromkeys(self._limits, time.monotonic())
-            for name in set(self.control.silent) - self._limits.keys():
-                self.control.heard(name)  # no later sign of life would end its silence
-            self._thread = threading.Thread(target=self._watch, name="vlagents-ray-watchdog", daemon=True)
-        self._thread.start()
-
-    def close(self) -> None:
-        """End the thread, after any running call of `stop`."""
-        with self._changed:
-            thread, self._thread = self._thread, None
-            self._changed.notify_all()
-        if thread is not None and thread is not threading.current_thread():
-            thread.join()
-
-    def __enter__(self) -> Watchdog:
-        self.start()
-        return self
-
-    def __exit__(self, *exc: object) -> None:
-        self.close()
-
-    def overdue(self) -> tuple[str | None, float | None]:
-        """Record the silence of a source whose time limit is over, and return its reason, for `bark`.
-
-        Returns:
-            The reason, or None; and the time, s, until the next limit may be over, or None.
-        """
-        with self._changed:
-            now, silent = time.monotonic(), self.control.silent
-            waiting = {n: self._heard[n] + s - now for n, s in self._limits.items() if n not in silent}
-            name = min(waiting, key=lambda n: waiting[n]) if waiting else None
-            if name is None or waiting[name] > 0:
-                return None, None if name is None else waiting[name]
-            reason = f"{name}: silent for {now - self._heard[name]:.2f} s"
-            self.control.stop(reason, silent=name)
-            return reason, None
-
-    def bark(self, reason: str) -> None:
-        """Call `stop`; its error is kept."""
-        self.barks.append(reason)
-        try:
-            with self.control.stopping():
-                self._stop(reason)
-        except Exception as error:  # noqa: BLE001 - the next silence must stop the robot as well
-            self.error = error
-
-    def _watch(self) -> None:
-        me = threading.current_thread()
-        while True:
-            with self._changed:
-                reason = None
-                while reason is None:
-                    if self._thread is not me:
-                        return
-                    reason, wait_s = self.overdue()
-                    if reason is None:
-                        self._changed.wait(wait_s)
-            self.bark(reason)
