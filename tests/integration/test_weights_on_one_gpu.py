@@ -36,7 +36,7 @@ def test_both_replicas_act_with_what_the_learner_hands_over(
     monkeypatch.setattr(AppTarget, "_push", spied)
     if device == "cpu":
         monkeypatch.setattr(shared_values, "_MEMORY", SharedCpuMemory())
-    caplog.set_level(logging.INFO, "vlagents_ray")
+    caplog.set_level(logging.INFO, "vlagents_ray_learn")
     resources = {"num_gpus": 0.2} if device == "cuda" else {}
     document = deployment("served_agents:OnOneGpu", config={"device": device}, replicas=2, resources=resources)
     learner = torch.nn.Linear(500, 400, device=device).requires_grad_(False)
