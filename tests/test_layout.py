@@ -105,3 +105,18 @@ def test_each_list_of_plugins_has_all_of_them() -> None:
     assert set(contracts["the core knows no plug-in"]["forbidden_modules"]) == OF_SERVER.keys()
     [installed] = re.findall(r"^PLUGINS \?= (.*)$", (ROOT / "Makefile").read_text(), re.MULTILINE)
     assert {f"vlagents_ray_{name}" for name in installed.split()} == OF_SERVER.keys()
+
+
+def test_architecture_names_each_module_and_folder_of_the_package_and_each_plugin() -> None:
+    tree = (ROOT / "ARCHITECTURE.md").read_text()
+    tops = {path.name for path in PACKAGE.iterdir() if path.suffix == ".py" or (path / "__init__.py").exists()}
+    unnamed = sorted(name for name in tops - {"__init__.py", "__main__.py"} if name not in tree)
+    assert unnamed == []
+    assert [name for name in PLUGINS if name not in tree] == []
+
+
+@pytest.mark.parametrize("name", PLUGINS)
+def test_a_plugins_readme_names_pages_that_exist(name: str) -> None:
+    readme = (ROOT / "plugins" / name / "README.md").read_text()
+    pages = re.findall(r"`(docs/[\w/]+\.md)", readme)
+    assert [page for page in pages if not (ROOT / page).exists()] == []

@@ -12,21 +12,28 @@ from vlagents_ray.serve.launch.deployment_file import read_deployment
 from vlagents_ray.serve.launch.server import running_server
 from vlagents_ray.testing import check_agent
 
+OBS = Obs(state={"joints": np.ones(3, np.float32)})
+ACTION = -0.1 * np.ones(3)  # of the policy for that observation
+
 
 def test_the_policy_is_registered_and_keeps_its_contract():
     assert policy_class("homing") is Homing
     check_agent(Homing())
 
 
+def test_the_policy_moves_each_joint_towards_zero():
+    np.testing.assert_allclose(Homing().act(OBS).action, ACTION, rtol=1e-6)
+
+
 def test_its_calls_are_counted_where_it_is_served():
-    obs = Obs(state={"joints": np.ones(3, np.float32)})
     with running_server(read_deployment("homing.yaml")) as server, RemoteAgent(server.url) as agent:
-        agent.reset(obs, "go home")
-        np.testing.assert_allclose(agent.act(obs).action, -0.1 * np.ones(3), rtol=1e-6)
+        agent.reset(OBS, "go home")
+        np.testing.assert_allclose(agent.act(OBS).action, ACTION, rtol=1e-6)
         with urllib.request.urlopen(f"{server.url}/homing/latency", timeout=10) as answer:
             assert json.load(answer)["calls"] == 1
 
 
 if __name__ == "__main__":
     test_the_policy_is_registered_and_keeps_its_contract()
+    test_the_policy_moves_each_joint_towards_zero()
     test_its_calls_are_counted_where_it_is_served()

@@ -144,3 +144,13 @@ def test_a_name_that_is_no_module_of_ones_own_is_refused(name: str, folder: Path
     status, said = new("policy", name)
     assert (status, "NAME" in said) == (2, True)
     assert list(folder.iterdir()) == []
+
+
+@pytest.mark.parametrize(
+    ("name", "kind"), [("noop", "policy"), ("openvla", "policy"), ("live", "part of a server"), ("eval", "command")]
+)
+def test_a_plugin_of_a_name_that_is_registered_is_refused(name: str, kind: str, folder: Path) -> None:
+    """Its own test could not pass."""
+    status, said = new("plugin", name)
+    assert (status, f"'{name}' is the name of a {kind} already" in said) == (2, True)
+    assert list(folder.iterdir()) == []

@@ -53,7 +53,7 @@ def policies_and_wrappers() -> Iterator[Listed]:
             try:
                 cls = find(name)
             except VLAgentsError as error:
-                yield Listed(kind, name, "its module is not here", str(error), [])
+                yield Listed(kind, name, "cannot be loaded", str(error), [])
                 continue
             what = (sys.modules[target_of(registered, name).partition(":")[0]].__doc__ or "").strip().partition("\n")[0]
             yield Listed(kind, name, what, missing_packages(name), list(settings_of(cls)))

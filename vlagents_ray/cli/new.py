@@ -14,12 +14,14 @@ import sys
 from importlib.resources import files
 from pathlib import Path
 from string import Template
-from typing import Annotated, Literal
+from typing import Annotated, Literal, cast
 
 import typer
+from typer.core import TyperGroup
 
 from vlagents_ray.cli.console import errors, out
 from vlagents_ray.errors import ConfigError
+from vlagents_ray.registry import names
 
 new = typer.Typer(no_args_is_help=True, help="Write a working skeleton, with its test, into the current folder.")
 # Of each kind, the files that are written, with $name for the name, and their templates in skeletons/KIND.
@@ -79,13 +81,22 @@ def dialect(name: Name) -> None:
 
 
 @new.command()
-def plugin(name: Name) -> None:
+def plugin(name: Name, context: typer.Context) -> None:
     """Write the folder NAME: a package with a policy, a part of the server and a command, and their test."""
     with errors():
+        commands = cast(TyperGroup, context.find_root().command)
+        registered = {
+            "policy": names("policies"),
+            "part of a server": names("replica"),
+            "command": commands.list_commands(context),
+        }
+        for kind, taken in registered.items():
+            if name in taken:
+                raise ConfigError(f"NAME: {name!r} is the name of a {kind} already; choose another one")
         _write(name, "plugin")
         command, python = as_typed("vlagents-ray"), as_typed("python")
         _print_steps(
-            (f"cd {name}", "its folder"),
+            (f"cd {name}", "the folder of the plug-in"),
             (f"{python} -m pip install --editable .", "registers it in this environment"),
             (f"{python} test_{name}.py", "checks it; so does pytest"),
             (f"{command} serve {name}.yaml", "serves it"),
@@ -129,7 +140,7 @@ def _write(name: str, kind: Kind) -> None:
             else:
                 path.unlink()
         raise
-    out.print(f"wrote {', '.join(map(str, texts))}. Next, in this folder:")
+    out.print(f"wrote {', '.join(map(str, texts))}. Next:")
     if kind != "plugin":
         _print_steps((f"{as_typed('python')} test_{name}.py", "checks it; so does pytest"))
 

@@ -4,6 +4,8 @@ A program that starts TorchRL's `ProcessInferenceServer` with an `MPTransport` u
 
     from vlagents_ray_learn.torchrl import PolicyServer as ProcessInferenceServer, ServerAddress as MPTransport
 
+Collectors are TorchRL's own: `ServedPolicy` is the module that they call (docs/evaluation/torchrl.md has one).
+
 Keys are those of `torchrl.data.vla`: of the image (camera "front"), the state (part "state") and the instruction.
 """
 
