@@ -48,6 +48,7 @@ def test_each_program_is_run_by_a_test() -> None:
     clients = {one.client for one in PROGRAMS.values()} - {""}
     script = (programs.ROOT / "tests/support/program_clients.py").read_text()
     assert [name for name in clients if f"def {name}(port: int)" not in script] == []
-    texts = "".join(file.read_text() for file in (programs.ROOT / "tests").glob("*/**/test_*.py"))
+    files = [*programs.ROOT.glob("tests/*/**/test_*.py"), *programs.ROOT.glob("plugins/*/tests/**/test_*.py")]
+    texts = "".join(file.read_text() for file in files)
     marked = [name for name, one in PROGRAMS.items() if not one.client and f'"{name}"' not in texts]
     assert marked == []
