@@ -12,6 +12,7 @@ import itertools
 import json
 import os
 import signal
+import select
 import socket
 import struct
 import subprocess
@@ -605,6 +606,9 @@ def http_robot(where: Where) -> Iterator[Callable[[], None]]:
     with contextlib.closing(HTTPConnection("127.0.0.1", where["proxied"], timeout=60)) as connection:
 
         def send(op: Op) -> None:
+            # As clients with a pool of connections do: HAProxy ends one that is idle, as between two rows.
+            if connection.sock is not None and select.select([connection.sock], [], [], 0)[0]:
+                connection.close()
             connection.request("POST", f"/v1/{op}", encode_requests([Request(op, OBS)]), headers)
             answer = connection.getresponse()
             content = answer.read()

@@ -25,14 +25,22 @@ from process_resources import descriptors, running_threads
 from shm_client import LIMITS, Keeper, call, client, request
 
 from vlagents_ray.client.transports.shm import ShmTransport, reaches
-from vlagents_ray.errors import ConnectionLost, DeadlineExceeded, InvalidObservation, PolicyUnavailable, UnknownSession
+from vlagents_ray.errors import (
+    ConnectionLost,
+    DeadlineExceeded,
+    InvalidObservation,
+    PolicyUnavailable,
+    Unauthorized,
+    UnknownSession,
+)
 from vlagents_ray.interface import Act, Agent, Obs
 from vlagents_ray.protocol import shm_layout
 from vlagents_ray.protocol.frames import encode_requests
 from vlagents_ray.protocol.messages import LocalAddress, Request, peer_uid
-from vlagents_ray.serve.access.api_keys import NoKey
+from vlagents_ray.serve.access.api_keys import Caller, NoKey
 from vlagents_ray.serve.endpoints.shm import ShmServer
 from vlagents_ray.serve.engine.engine import Engine
+from vlagents_ray.serve.engine.sender import REFUSALS
 
 
 @pytest.fixture
@@ -394,3 +402,29 @@ def test_what_could_not_be_sent_keeps_no_memory() -> None:
         assert sum(memory.busy for memory in transport._memories) == busy[-1]
         assert len(transport._memories) <= busy[-1] + 1
         transport.close()
+
+
+def test_a_client_whose_key_is_refused_is_answered_a_few_times_and_then_ended() -> None:
+    """Otherwise a process without a key occupies the policy's thread, which answers each of its messages."""
+    keys: list[str | None] = []
+
+    def admit(key: str | None) -> Caller:
+        keys.append(key)
+        raise Unauthorized("an unknown key")
+
+    engine = Engine(Keeper())
+    endpoint = ShmServer(engine, LIMITS, admit)
+    endpoint.open()
+    stranger = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+    stranger.connect(f"\0{endpoint.address.socket}")
+    for _ in range(50):
+        stranger.send(b"wrong")
+    engine.start()
+    stranger.settimeout(10)
+    answers = list(iter(lambda: stranger.recv(10_000), b""))
+    stranger.close()
+    assert keys == ["wrong"] * REFUSALS
+    assert len(answers) == REFUSALS
+    wait_for(lambda: not endpoint._clients)
+    engine.close()
+    endpoint.close()

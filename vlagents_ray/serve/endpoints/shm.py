@@ -48,7 +48,7 @@ from vlagents_ray.serve.endpoints.connection import (
 )
 from vlagents_ray.serve.engine.admission import Admission, MessageAdmission
 from vlagents_ray.serve.engine.engine import Engine
-from vlagents_ray.serve.engine.sender import REFUSED, Sender
+from vlagents_ray.serve.engine.sender import REFUSALS, REFUSED, Sender
 from vlagents_ray.serve.requests import Message
 
 logger = logging.getLogger(__name__)
@@ -121,6 +121,7 @@ class UnixConnection(PolledConnection):
         self._reader = shm_layout.ShmReader(server.limits)
         self._connected_at = time.monotonic()
         self._key: bytes | None = None  # the key as sent
+        self._refused_keys = 0  # number of messages whose key was refused
         self._unanswered = 0  # number of messages
         self._paused = False  # whether too many are unanswered
         if isinstance(server.admit, NoKey):
@@ -158,7 +159,12 @@ class UnixConnection(PolledConnection):
         except VLAgentsError as error:
             message.refuse(error)
             self._write(message)
-            if self._sender is not None and self._sender.refused_too_often:
+            if self._sender is None:
+                self._refused_keys += 1
+                if self._refused_keys >= REFUSALS:
+                    self.end(f"its key was refused {REFUSALS} times; connect with another one")
+                    self.disconnect()  # its further messages are not read
+            elif self._sender.refused_too_often:
                 self.end(REFUSED)
         finally:
             for descriptor in descriptors:
@@ -198,7 +204,7 @@ class UnixConnection(PolledConnection):
         sender.send(message, decoded, self._write, admission=admission, waited_s=waited_s)
 
     def _authenticate(self, message: bytes) -> Sender | None:
-        """Read the key from the first message; if it is refused, check it again at each later message."""
+        """Read the key from the first message; if it is refused, check it again at later ones, `REFUSALS` times."""
         if isinstance(self._admit, NoKey):
             raise TypeError(f"a key, although none is asked for: {self._admit.value}")
         first, self._key = self._key is None, self._key or message
