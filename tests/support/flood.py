@@ -11,8 +11,8 @@ import hashlib
 import itertools
 import json
 import os
-import signal
 import select
+import signal
 import socket
 import struct
 import subprocess
