@@ -203,12 +203,12 @@ HTTP_TABLE = [
 ]
 
 
-# A row takes about ten seconds: every fourth one by default, all with VLAGENTS_FLOOD_ALL=1. Those over HTTP are only
-# among all: HAProxy, the server, the robot and the flood share the cores, and two of the rows are over the bound on two.
-if os.environ.get("VLAGENTS_FLOOD_ALL"):
-    ROWS = [*TABLE, *GATEWAY_TABLE, *HTTP_TABLE]
-else:
-    ROWS = [*TABLE, *GATEWAY_TABLE][::4]
+# A row takes about ten seconds: every fourth one by default, all with VLAGENTS_FLOOD_ALL=1. Those
+# over HTTP are only among all: HAProxy, the server, the robot and the flood share the cores, and
+# one of them is over the bound on two.
+ALL_ROWS = [*TABLE, *GATEWAY_TABLE, *HTTP_TABLE]
+FEW_ROWS = [*TABLE, *GATEWAY_TABLE][::4]
+ROWS = ALL_ROWS if os.environ.get("VLAGENTS_FLOOD_ALL") else FEW_ROWS
 
 
 @pytest.mark.parametrize(("way", "behaviour"), ROWS)
