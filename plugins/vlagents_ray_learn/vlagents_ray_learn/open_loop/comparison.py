@@ -171,7 +171,9 @@ def open_datasets(folder: Path) -> list[RecordedDataset]:
     Raises:
         ConfigError: There is none, or their actions differ.
     """
-    files = [path for pattern in ("", "*/") for path in sorted(folder.glob(f"{pattern}meta/info.json"))]
+    own_file = sorted(folder.glob("meta/info.json"))
+    files_below = sorted(folder.glob("*/meta/info.json"))
+    files = [*own_file, *files_below]
     if not files:
         raise ConfigError(f"{folder}: expected a LeRobotDataset, or a folder of them, got no meta/info.json")
     datasets = [RecordedDataset(path.parents[1]) for path in files]
